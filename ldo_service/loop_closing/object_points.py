@@ -73,7 +73,7 @@ class DetectionPoints:
         return DetectionPoints(np.zeros(0, np.uint8), np.zeros(0, np.float32), nowhere)
 
     def histogram(self) -> np.ndarray:
-        """Return the sum of the scores of each label, [C] float32; 0 for background and `other`."""
+        """Return the summed scores of each label, [256] float32; 0 for background and `other`."""
         counts = np.bincount(self.labels, self.scores, MAX_LABELS).astype(np.float32)
         counts[:HIDDEN_NAMES] = 0
         return counts
@@ -129,7 +129,7 @@ class SubgraphLandmarks:
 
     @property
     def distributions(self) -> np.ndarray:
-        """Dense distributions, [K, C] float64."""
+        """Dense label distributions of the K landmarks, [K, 256] float64."""
         return dense(self.labels, self.weights)
 
     @property

@@ -1,4 +1,4 @@
-"""Place database: stored subgraphs, and the search for those that resemble a new one (coarse step).
+"""Place database: stored subgraphs, and the search for those that resemble a new one.
 
 Histograms are compared by TF-IDF. The weight of a word comes from the number of stored subgraphs
 that contain it.

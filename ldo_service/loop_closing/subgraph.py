@@ -109,7 +109,7 @@ class Subgraph:
         path_m: Length of the camera path up to the newest keyframe, meters.
         has_detections: True if a detector ran on one of the keyframes.
         landmarks: Landmarks in the odometry frame of the submap.
-        names: Histogram of labels, weighted by the detection scores, [C] float32.
+        names: Histogram of labels, weighted by the detection scores, [256] float32.
         layout: Histogram of pairs of labels and distances, [512] float32.
         words: Histogram of visual words, [W] float32.
     """

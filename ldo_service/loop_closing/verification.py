@@ -1,9 +1,10 @@
-"""Verification of loop candidates: the pose between two keyframes of two subgraphs (fine step).
+"""Verification of loop candidates: the pose between two keyframes of two subgraphs.
 
-A pose comes from ORB features, from landmarks or from the map. Landmarks or a second keyframe of
-the new subgraph must confirm the pose, and the landmarks must not contradict it. Direct alignment
-then refines the pose on the images. This may change it only a little. At the refined pose, the
-surfaces must overlap without conflict. Conventions: `ldo_service.geometry`.
+A subgraph is a group of consecutive keyframes. `place_database` finds pairs of similar subgraphs,
+the candidates. A pose comes from ORB features, from landmarks or from the map. Landmarks or a
+second keyframe of the new subgraph must confirm the pose, and the landmarks must not contradict it.
+Direct alignment then refines the pose on the images. This may change it only a little. At the
+refined pose, the surfaces must overlap without conflict. Conventions: `ldo_service.geometry`.
 """
 
 from collections.abc import Callable, Iterator
@@ -42,8 +43,7 @@ NOTHING = LandmarkAgreement(0, 0, 0.0, 0.0)
 Evidence = Literal["", "landmarks", "features", "map"]
 # Function of an old and a new keyframe that returns T_old_new [4, 4], or None if it is unknown.
 KnownPose = Callable[[SubgraphKeyframe, SubgraphKeyframe], np.ndarray | None]
-# Maximum number of decompressed keyframes in the cache, 3 MB each: those of a new subgraph and of
-# some candidates.
+# Maximum decompressed keyframes in the cache, 3 MB each: of a new subgraph and some candidates.
 OPENED = 12
 FIT_LEVEL = 1  # Pyramid level of 160 pixels width: 19,200 points suffice for the overlap.
 
