@@ -27,7 +27,7 @@ class Flat:
 
 
 def furnished_flat(seed: int) -> Flat:
-    """Return the flat; `seed` determines its textures and the material of each object."""
+    """Return the flat of two rooms; `seed` determines its textures and the objects' materials."""
     placed = things(seed)
     return Flat(
         panels=panels(),

@@ -52,14 +52,14 @@ class Placement:
 
 @dataclass(frozen=True, slots=True)
 class SceneObject:
-    """Class name and solids of one object; all solids are in one frame."""
+    """Class name and solids of one object, all in one frame: its own, its room's or the world."""
 
     label: str
     solids: tuple[Solid, ...]
 
     @property
     def bounds_m(self) -> tuple[np.ndarray, np.ndarray]:
-        """Center [3] and size [3], meters, of the bounding box in the frame of the solids."""
+        """Center [3] and size [3], meters, of the box around `solids`, in their common frame."""
         corners = np.concatenate([solid.corners_m() for solid in self.solids])
         low, high = corners.min(axis=0), corners.max(axis=0)
         return (low + high) / 2, high - low

@@ -97,7 +97,7 @@ def section_x_m(number: int) -> float:
 
 
 def furnished_twins(seed: int) -> Flat:
-    """Return the building of `twins`; `seed` determines its textures and materials.
+    """Return the building of four equal offices; `seed` determines its textures and materials.
 
     Rooms 0 to 3 are the offices, rooms 4 to 7 the sections of the corridor.
     """

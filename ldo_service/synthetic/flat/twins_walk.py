@@ -60,5 +60,5 @@ def knots() -> np.ndarray:
 
 
 def twins_walk(seed: int) -> CameraPath:
-    """Return the walk; `seed` determines sway and tremor of the hand."""
+    """Return a walk along the four equal offices; `seed` determines sway and tremor of the hand."""
     return hand_held(seed, knots(), FRAMES, WALK_M_S)

@@ -117,14 +117,18 @@ def _shake(
 
 
 def timed_positions(knots: np.ndarray = KNOTS, walk_m_s: float = WALK_M_S) -> np.ndarray:
-    """Return the spline parameter [M + 1], in knots, at equal time steps around the walk.
+    """Return positions on the closed spline through K knots at equal steps of time.
 
-    Long steps and steps with a large turn take more time, according to walk_m_s and TURN_RAD_S. The
-    sequence scales all times to its own duration.
+    The walk is divided into 64 K steps of equal duration. Parts that are long or have a large turn
+    take more of them, according to walk_m_s and TURN_RAD_S. The sequence scales the walk to its own
+    duration.
 
     Args:
         knots: Camera center x, y, z in meters and viewing direction of each knot, [K, 6].
         walk_m_s: Speed of walking.
+
+    Returns:
+        Spline parameters in knots, [64 K + 1]: 1.5 is halfway from knot 1 to knot 2.
     """
     place = np.arange(len(knots) * STEPS_PER_KNOT + 1) / STEPS_PER_KNOT
     state = closed_spline(knots, place[:-1])

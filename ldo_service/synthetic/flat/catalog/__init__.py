@@ -1,8 +1,8 @@
 """Catalog of object builders by class name; many classes have several shapes.
 
-A builder takes the materials and a shape number. It returns solids in the object's own frame: the
-front faces -y, and the origin is the center of the underside. For objects on a wall, the origin is
-the center of the back.
+A builder takes the materials and a shape number. The number counts from 0; builders with a single
+shape ignore it. A builder returns solids in the object's own frame: the front faces -y, and the
+origin is the center of the underside. For objects on a wall, the origin is the center of the back.
 """
 
 from . import machines, rooms, small

@@ -7,7 +7,7 @@ from ldo_service.synthetic.flat.scene_object import Heading
 from ldo_service.synthetic.solids import Shape, Solid
 
 Solids = tuple[Solid, ...]
-Builder = Callable[[Materials, int], Solids]
+Builder = Callable[[Materials, int], Solids]  # Function of materials and shape number.
 Triple = tuple[float, float, float]
 
 

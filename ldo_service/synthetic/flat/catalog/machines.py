@@ -6,7 +6,7 @@ from .build import Builder, Solids, ball, box, cylinder, legs, solid
 
 
 def tv(paint: Materials, shape: int) -> Solids:
-    """Build a wide TV on a foot, or a flat one for the wall."""
+    """Build a TV: shape 0 stands on a foot, 1 is smaller and for the wall."""
     case, width = paint("plastic"), 1.0 if shape == 0 else 0.8
     height = 0.56 * width
     z = 0.06 if shape == 0 else 0.0
@@ -73,7 +73,7 @@ def toilet(paint: Materials, _: int) -> Solids:
 
 
 def speaker(paint: Materials, shape: int) -> Solids:
-    """Build a tower speaker, or a small one for a shelf."""
+    """Build a speaker: shape 0 is a tower, 1 is a small one for a shelf."""
     case, cone = paint("wood"), paint("screen")
     height, width = (0.8, 0.22) if shape == 0 else (0.3, 0.18)
     at = [(0.3 * height, 0.16), (0.68 * height, 0.12)]
@@ -169,7 +169,7 @@ def cell_phone(paint: Materials, _: int) -> Solids:
 
 
 def book(paint: Materials, shape: int) -> Solids:
-    """Build one flat book, a stack, or a standing row."""
+    """Build books: shape 0 is one flat book, 1 is a stack, 2 is a standing row."""
     if shape == 0:
         return (box((0, 0, 0), (0.17, 0.24, 0.035), paint("print"), (0.96, 0.28)),)
     if shape == 1:
@@ -181,7 +181,7 @@ def book(paint: Materials, shape: int) -> Solids:
 
 
 def clock(paint: Materials, shape: int) -> Solids:
-    """Build a round or square wall clock with a pale face and dark hands."""
+    """Build a wall clock with a pale face and dark hands: shape 0 is round, 1 is square."""
     rim, hand = paint("plastic"), paint("screen")
     body = solid("wheel", (0, -0.02, -0.16), (0.04, 0.32, 0.32), rim, (0.0, 1.0))
     if shape == 1:
@@ -194,7 +194,7 @@ def clock(paint: Materials, shape: int) -> Solids:
 
 
 def picture_frame(paint: Materials, shape: int) -> Solids:
-    """Build a picture frame for the wall: shape 0 is portrait, 1 landscape, 2 square."""
+    """Build a picture frame for the wall: shape 0 is portrait, 1 is landscape, 2 is square."""
     width, height = ((0.5, 0.64), (0.9, 0.6), (0.34, 0.34))[shape]
     rim = box((0, -0.015, -height / 2), (width, 0.03, height), paint("wood"))
     inner = (width - 0.08, 0.004, height - 0.08)

@@ -40,7 +40,7 @@ FIXTURES: dict[str, Builder] = {"door": door, "window": window, "coat rack": coa
 
 
 def chair(paint: Materials, shape: int) -> Solids:
-    """Build a kitchen chair, a stool with a back, or an office chair."""
+    """Build a chair: shape 0 is a kitchen chair, 1 is a stool with a back, 2 is an office chair."""
     seat, frame = paint("fabric"), paint("wood")
     if shape == 0:
         posts = [box((x, 0.19, 0.47), (0.04, 0.04, 0.45), frame) for x in (-0.18, 0.18)]
@@ -66,7 +66,7 @@ def chair(paint: Materials, shape: int) -> Solids:
 
 
 def couch(paint: Materials, shape: int) -> Solids:
-    """Build a couch of two seats with arms, or a longer one without arms."""
+    """Build a couch of two seats: shape 0 has arms, 1 is longer and has none."""
     cover, seat = paint("fabric"), paint("fabric")
     width = 1.5 if shape == 0 else 1.8
     body = box((0, 0, 0.08), (width, 0.8, 0.3), cover)
@@ -91,7 +91,10 @@ def bed(paint: Materials, _: int) -> Solids:
 
 
 def dining_table(paint: Materials, shape: int) -> Solids:
-    """Build a table on four legs, a round one on a foot, or a long desk on two side panels."""
+    """Build a table.
+
+    Shape 0 stands on four legs, 1 is round and stands on a foot, 2 is a long desk on two panels.
+    """
     top = paint("wood")
     if shape == 0:
         return (*legs(1.1, 0.66, 0.7, 0.06, top), box((0, 0, 0.7), (1.16, 0.72, 0.04), top))
@@ -110,7 +113,7 @@ def bench(paint: Materials, _: int) -> Solids:
 
 
 def shelf(paint: Materials, shape: int) -> Solids:
-    """Build a tall bookcase, or a low one."""
+    """Build a bookcase: shape 0 is tall, 1 is low."""
     wood = paint("wood")
     height, width = (1.8, 0.9) if shape == 0 else (0.8, 0.7)
     sides = [box((s * width / 2, 0, 0), (0.03, 0.3, height), wood) for s in (-1, 1)]
@@ -120,7 +123,7 @@ def shelf(paint: Materials, shape: int) -> Solids:
 
 
 def cabinet(paint: Materials, shape: int) -> Solids:
-    """Build a sideboard, or a kitchen unit with a worktop."""
+    """Build a cabinet: shape 0 is a sideboard, 1 is a kitchen unit."""
     front, metal = paint("wood" if shape == 0 else "plastic"), paint("metal")
     width = 1.1 if shape == 0 else 1.2
     body = box((0, 0, 0.05), (width, 0.44, 0.75), front)
@@ -133,18 +136,23 @@ def cabinet(paint: Materials, shape: int) -> Solids:
 
 
 def cushion(paint: Materials, shape: int) -> Solids:
+    """Build a cushion: shape 0 has a printed pattern, 1 has plain fabric."""
     cover = paint("print" if shape == 0 else "fabric")
     return (ball((0, 0, 0), (0.44, 0.2, 0.42), cover),)
 
 
 def rug(paint: Materials, shape: int) -> Solids:
+    """Build a rug: shape 0 is rectangular, 1 is round."""
     if shape == 0:
         return (box((0, 0, 0), (1.7, 1.1, 0.012), paint("print")),)
     return (cylinder((0, 0, 0), 1.2, 0.012, paint("print")),)
 
 
 def lamp(paint: Materials, shape: int) -> Solids:
-    """Build a floor lamp, a table lamp with a cone shade, or a ball on a rod."""
+    """Build a lamp.
+
+    Shape 0 is a floor lamp, 1 is a table lamp with a cone shade, 2 is a ball on a rod.
+    """
     metal, shade = paint("metal"), paint("fabric")
     if shape == 0:
         foot = (cylinder((0, 0, 0), 0.3, 0.03, metal), cylinder((0, 0, 0.03), 0.03, 1.3, metal))
@@ -157,7 +165,7 @@ def lamp(paint: Materials, shape: int) -> Solids:
 
 
 def potted_plant(paint: Materials, shape: int) -> Solids:
-    """Build a bush, a tree of three balls, or a conifer of cones, each in a pot."""
+    """Build a plant in a pot: shape 0 is a bush, 1 is a tree of three balls, 2 is a conifer."""
     leaves, pot = paint("leaves"), solid("bucket", (0, 0, 0), (0.3, 0.3, 0.28), paint("ceramic"))
     if shape == 0:
         return pot, ball((0, 0, 0.22), (0.5, 0.5, 0.52), leaves)

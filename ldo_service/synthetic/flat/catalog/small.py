@@ -6,7 +6,7 @@ from .build import Builder, Solids, ball, box, cylinder, solid
 
 
 def bottle(paint: Materials, shape: int) -> Solids:
-    """Build a slim bottle with a neck, or a wide one with a cone as its shoulder."""
+    """Build a bottle: shape 0 is slim, 1 is wide with a cone as its shoulder."""
     glass = paint("ceramic")
     if shape == 0:
         return cylinder((0, 0, 0), 0.075, 0.2, glass), cylinder((0, 0, 0.2), 0.03, 0.1, glass)
@@ -19,7 +19,7 @@ def bottle(paint: Materials, shape: int) -> Solids:
 
 
 def cup(paint: Materials, shape: int) -> Solids:
-    """Build a mug with a handle, or a tapered beaker."""
+    """Build a cup: shape 0 is a mug with a handle, 1 is a tapered beaker."""
     glaze = paint("ceramic")
     if shape == 0:
         ear = box((0.06, 0, 0.02), (0.035, 0.015, 0.06), glaze)
@@ -38,7 +38,7 @@ def bowl(paint: Materials, _: int) -> Solids:
 
 
 def vase(paint: Materials, shape: int) -> Solids:
-    """Build a round vase with a neck, or a tall tapered one."""
+    """Build a vase: shape 0 is round with a neck, 1 is tall and tapered."""
     glaze = paint("ceramic")
     if shape == 0:
         neck = solid("bucket", (0, 0, 0.2), (0.1, 0.1, 0.12), glaze)
@@ -79,7 +79,7 @@ def backpack(paint: Materials, _: int) -> Solids:
 
 
 def suitcase(paint: Materials, shape: int) -> Solids:
-    """Build an upright suitcase with its handle extended, or a flat old one."""
+    """Build a suitcase: shape 0 is upright with its handle extended, 1 is old and lies flat."""
     shell, metal = paint("plastic"), paint("metal")
     if shape == 1:
         return box((0, 0, 0), (0.6, 0.4, 0.2), paint("wood")), box(
@@ -170,7 +170,7 @@ def bucket(paint: Materials, _: int) -> Solids:
 
 
 def cardboard_box(paint: Materials, shape: int) -> Solids:
-    """Build one box, or a small one on a large one."""
+    """Build a cardboard box: shape 0 is one box, 1 has a smaller box on top."""
     first = box((0, 0, 0), (0.46, 0.36, 0.32), paint("plastic"))
     tape = box((0, 0, 0.32), (0.06, 0.36, 0.003), paint("wood"))
     if shape == 0:
@@ -188,7 +188,7 @@ def toolbox(paint: Materials, _: int) -> Solids:
 
 
 def trash_can(paint: Materials, shape: int) -> Solids:
-    """Build a bin that widens upward, or a cylinder with a dome."""
+    """Build a bin: shape 0 widens upward, 1 is a cylinder with a dome."""
     if shape == 0:
         return (solid("bucket", (0, 0, 0), (0.28, 0.28, 0.36), paint("plastic")),)
     case = paint("metal")
