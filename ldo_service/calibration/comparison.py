@@ -31,7 +31,7 @@ from .views import (
     reprojection,
 )
 
-TIME_TERMS = 3  # Readout of color, readout and delay of depth.
+TIME_TERMS = 3  # Readout of color, readout of depth and delay of depth.
 BIAS = slice(0, BIAS_TERMS)
 TIMES = slice(BIAS_TERMS, BIAS_TERMS + TIME_TERMS)
 # Depth noise of structured light, meters (Nguyen et al., 2012): s0 + s1 (z - z0)^2.
@@ -69,7 +69,9 @@ class ComparedPair:
     first: CalibrationView  # View `pair.first`, whose depth is used.
     second: CalibrationView  # View `pair.second`.
     pair: ViewPair
-    shared: np.ndarray  # [6] coefficients of the bias, then times of the shutter.
+    # [6]: coefficients of the depth bias [3], 1/m; then readout of color, readout of depth and
+    # delay of depth [3], seconds.
+    shared: np.ndarray
 
 
 @lru_cache(maxsize=2)

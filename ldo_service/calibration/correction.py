@@ -138,7 +138,7 @@ class CorrectionHistory:
 
 
 def read_corrections(folder: Path) -> CorrectionHistory:
-    """Return the corrections of the keyframes of a finished run.
+    """Return the camera correction with which each keyframe of a finished run was made.
 
     A keyframe from an older version has no correction and counts as not corrected.
 

@@ -41,7 +41,10 @@ class Block:
 
     @property
     def products(self) -> np.ndarray:
-        """Weighted sum of the products of each row with itself, [..., K + M + 1, K + M + 1]."""
+        """Weighted sum of the outer products of the N rows, [..., K + M + 1, K + M + 1].
+
+        K is the number of shared coefficients, M that of the block's own unknowns.
+        """
         return np.swapaxes(self.rows * self.weight[..., None], -1, -2) @ self.rows
 
 
@@ -76,7 +79,14 @@ class Reduced:
         return Reduced(rest[..., :K], rest[..., K], own)
 
     def own_step(self, step: np.ndarray) -> np.ndarray:
-        """Return the block's own step [..., M] for a step [..., K] of the shared coefficients."""
+        """Return the step of the block's own unknowns for a step of the shared coefficients.
+
+        Args:
+            step: Step dc of the K shared coefficients, [..., K].
+
+        Returns:
+            The step dx of the M own unknowns, [..., M].
+        """
         return -(self.own[..., :-1] @ step[..., None])[..., 0] - self.own[..., -1]
 
 
@@ -93,7 +103,7 @@ class HeldOutResiduals:
 
     @property
     def residual_ratio(self) -> float:
-        """Ratio rms_with / rms_without of the held-out residuals; 1 if rms_without is 0."""
+        """Residual with the estimated coefficients divided by that without; 1 if that is 0."""
         return self.rms_with / self.rms_without if self.rms_without > 0 else 1.0
 
 
@@ -179,7 +189,8 @@ def check(
 ) -> Generator[float, None, list[HeldOutResiduals]]:
     """Compute the residuals of held-out blocks; yield the amount of work after each block.
 
-    Each group of blocks is held out once, and the coefficients are estimated from the other blocks.
+    Successive blocks form groups, at most GROUPS in all. Each group is held out once, and the
+    coefficients are estimated from the other blocks.
 
     Args:
         blocks: Blocks.

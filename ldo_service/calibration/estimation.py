@@ -278,7 +278,8 @@ def _color_weight(rows: np.ndarray, now: np.ndarray, own: np.ndarray | None) -> 
     """Compute the weights [3, N] of the rows [3, N, 6] of a pair from their residuals.
 
     Args:
-        rows: Derivatives by vignetting, gain and offset, and the residual without vignetting.
+        rows: Derivatives with respect to vignetting, gain and offset, and the residual without
+            vignetting.
         now: Coefficients of the vignetting, [3, 3].
         own: Gain and offset of the pair, [3, 2]; None if unknown.
     """

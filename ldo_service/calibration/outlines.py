@@ -6,7 +6,7 @@ is then at X + cross(r, X) + s in the color camera. An outline, where depth jump
 surface to a far one, lies some pixels beside the edge in the color image. The shift along the
 normal n of the outline is n J (xi + v t) + w:
 
-- J [2, 6] is the derivative of the pixel by xi;
+- J [2, 6] is the derivative of the pixel with respect to xi;
 - v [6] is the velocity of the camera in its own frame, rad/s and m/s;
 - t is the error of the delay of depth, seconds;
 - w is the width by which the depth camera widens all near surfaces, pixels.
@@ -97,7 +97,11 @@ class Extrinsics:
     covariance: np.ndarray  # [6, 6] of xi.
 
     def metrics(self) -> dict[str, float]:
-        """Return rotation, translation and shift with their standard deviations, by name."""
+        """Return the components of xi, the image shift, and their standard deviations, by name.
+
+        The names end in the units. The shift is that of depth in the image center, at
+        SHIFT_DEPTH_M: `depth_color_shift_u_mrad` and `depth_color_shift_v_mrad`.
+        """
         sigmas = np.sqrt(np.diag(COMPONENTS @ self.covariance @ COMPONENTS.T)).tolist()
         values = (COMPONENTS @ self.xi).tolist()
         return dict(zip((*NAMES, *SIGMA_NAMES), (*values, *sigmas), strict=True))

@@ -127,8 +127,8 @@ class ViewMaker:
 
         Args:
             frame: The frame.
-            T_odom_camera: Its pose, [4, 4], by which the motion of the corners is predicted; None
-                while tracking is LOST.
+            T_odom_camera: Its pose, [4, 4]. It predicts where the corners tracked in the last view
+                are now. None while tracking is LOST.
             velocity: Velocity of the camera, see `CalibrationView.velocity`; None if unknown.
         """
         camera = frame.camera
