@@ -143,7 +143,7 @@ class Adam:
         Args:
             gaussians: The map; its rows change.
             rasterizer: The rasterizer that last rendered this map.
-            by_planes: Derivatives of the loss by the planes that `Rasterizer.render` returns,
+            by_planes: Derivatives of the loss with respect to the output of `Rasterizer.render`,
                 [5, H, W].
             rate: Factor on the configured learning rates.
             needle_weight: Weight of the penalty on needle-shaped Gaussians; see

@@ -35,8 +35,8 @@ class LoopRefitConfig:
     # Maximum number of keyframes that are deduplicated at the end, newest first; takes some
     # seconds.
     deduplicated_at_end: int = 200
-    # Iterations after the deduplication of each keyframe. A new keyframe gets at least this number
-    # (`MapperConfig.min_iterations`).
+    # Iterations after the deduplication of each keyframe: as many as `MapperConfig.min_iterations`
+    # guarantees to a new keyframe.
     deduplication_iterations: int = 3
     # Refit iterations for each displaced keyframe, half of them on other keyframes.
     iterations: int = 12
@@ -134,7 +134,7 @@ class LoopRefit:
 
     @property
     def deduplication_iterations(self) -> int:
-        """Number of optimizer iterations that follow the deduplication of the next new keyframe."""
+        """Number of optimizer iterations that `with_keyframe` will run after deduplication."""
         config = self.config
         return config.deduplication_iterations * min(
             config.deduplicated_per_keyframe, len(self._to_deduplicate)

@@ -304,8 +304,8 @@ class OffloadedGaussians:
             chunk = unpack(self.files.read(number))
             if (chunk.anchor, len(chunk.ids)) != (entry.anchor, entry.count):
                 raise DataError(
-                    f"the file holds {len(chunk.ids)} Gaussians of anchor {chunk.anchor}, "
-                    f"expected {entry.count} of anchor {entry.anchor}"
+                    f"file {number} holds {len(chunk.ids)} Gaussians of anchor keyframe "
+                    f"{chunk.anchor}, expected {entry.count} of {entry.anchor}"
                 )
         except DataError as error:
             self._lose(number, str(error))

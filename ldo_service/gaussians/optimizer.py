@@ -93,8 +93,8 @@ class GaussianOptimizerConfig:
     # frames of an apartment. Limits of 14 and 10 cost 0.3 and 0.6 dB in the sequence kitchen.
     max_sigma_px: float = 20.0
 
-    # Fraction of the effort after a new keyframe that is spent at half resolution, before the rest.
-    # Such an iteration improves the map almost as much as one at full resolution.
+    # Fraction of the computing time after a new keyframe that is spent on iterations at half
+    # resolution, before the others. They improve the map almost as much as the others.
     half_share: float = 0.8
     # Number of visible Gaussians at which an iteration is assumed to spend half of its time on the
     # pixels and half on the Gaussians. The effort of an iteration is computed from it.

@@ -66,8 +66,9 @@ class OptimizerBackend(Protocol):
             rate: Factor on all learning rates.
 
         Returns:
-            Loss before the step, and the visible Gaussians. Their weights are sums over the pixels
-            of the full image, also at half resolution. They are valid until the next rendering.
+            Loss before the step, and the visible Gaussians, which are valid until the next
+            rendering. Blending weights are sums over the pixels of the full image; those of a
+            rendering at half resolution are multiplied by 4.
         """
         ...
 
@@ -159,7 +160,7 @@ class CpuBackend:
             needle_ratio=self._limits.max_needle_ratio,
             max_sigma_px=self._limits.max_sigma_px / binning,
         )
-        if binning > 1:  # The weights are in pixels of the full image.
+        if binning > 1:  # The weights are sums over the pixels of the full image.
             visible = replace(visible, weights=visible.weights * binning**2)
         return loss, visible
 
