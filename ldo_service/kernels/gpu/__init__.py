@@ -8,7 +8,7 @@ does.
 - `arithmetic`: exponentials and logarithms of IEEE operations.
 - `projection`, `blending`: rendering of the image planes that the loss needs.
 - `loss`, `block_means`: image loss with its derivatives, and the block means for the exposure.
-- `projection_gradient`: derivatives by the Gaussians, and a step of Adam.
+- `projection_gradient`: derivatives with respect to the Gaussians, and a step of Adam.
 - `arrays`: memory, sorting and sums, in NumPy for the interpreter and in torch for a GPU.
 - `plane_rendering`, `frame_loss`, `descent`: functions that launch the kernels of one iteration.
 """

@@ -61,11 +61,11 @@ def largest_of_block(T):
 def blend_forward(splats, listed, reached, starts, columns, width, height, planes, ends):
     """Blend the splats of each tile.
 
-    A block checks its transmittance after each fourth splat that reaches it, counted from the start
-    of a batch, and at the end of a batch, like the C++ kernel.
+    The pairs of a tile are counted in batches of BATCH. A block checks its transmittance after each
+    fourth splat of the batch that reaches it, and at the end of the batch, like the C++ kernel.
 
     Args:
-        splats: [N, 16].
+        splats: [N, 16]; the module `projection` describes the layout.
         listed: Splat of each pair, [P]: tile by tile, front to back.
         reached: Bit mask of the blocks of the tile that each pair reaches, [P].
         starts: First pair of each tile, [tiles + 1].
@@ -144,7 +144,7 @@ def blend_backward(
     the mean of q over the splats behind it; see `kernels/blend_gradient.hpp`.
 
     Args:
-        splats: [N, 16].
+        splats: [N, 16]; the module `projection` describes the layout.
         listed: Splat of each pair, [P]: tile by tile, front to back.
         reached: Bit mask of the blocks of the tile that each pair reaches, [P].
         origins: Row of `sums` that each pair writes, [P]; those of a splat are contiguous.
@@ -154,7 +154,7 @@ def blend_backward(
         width: Width of the image, pixels.
         height: Height of the image, pixels.
         planes: Output of `blend_forward`, [5, height, width].
-        by_planes: Derivatives of the loss by the planes, [5, height, width].
+        by_planes: Derivatives of the loss with respect to the planes, [5, height, width].
         sums: Output, [P, 16], which holds zeros before.
     """
     tile = tl.program_id(0)

@@ -1,4 +1,4 @@
-"""Means of the rendered planes over square blocks, from which the exposure is estimated."""
+"""Means of rendered color and opacity over square blocks, to estimate the exposure."""
 
 import triton.language as tl
 
@@ -10,7 +10,7 @@ def block_means(planes, width, height, side, across, down, out, LANES: tl.conste
     """Average color and opacity over blocks of side x side pixels, one program per mean.
 
     Args:
-        planes: Rendering, [5, height, width].
+        planes: Rendering, [5, height, width]: red, green, blue, weighted depth, opacity.
         width: Width of the image, pixels.
         height: Height of the image, pixels.
         side: Side of a block, pixels.

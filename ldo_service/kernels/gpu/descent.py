@@ -1,4 +1,4 @@
-"""Derivatives of a rendering by the Gaussians, and a step of Adam."""
+"""Derivatives of a rendering with respect to the Gaussians, and a step of Adam."""
 
 from dataclasses import dataclass
 from math import inf
@@ -39,10 +39,10 @@ class AdamState:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Derivatives:
-    """Derivatives of the loss on the device, and the derivative by the pose on the host.
+    """Derivatives of the loss: those of the Gaussians on the device, those of the pose on the host.
 
     Attributes:
-        rows: Derivatives by the visible rows, [V, 16]; undefined after a step of Adam.
+        rows: Derivatives with respect to the visible rows, [V, 16]; undefined after a step of Adam.
         weights: Blending weights of the visible rows summed over the pixels, [V].
         xi: dL/dxi at xi = 0 of T_map_camera exp(xi), [6] float64: rotation rad, translation m.
     """
@@ -77,7 +77,7 @@ def backpropagate(
         arrays: Arrays of the device.
         rows: Rows of the rendering, unchanged since then; a step changes them in place.
         rendering: The rendering.
-        by_planes: Derivatives of the loss by the planes, [5, H, W].
+        by_planes: Derivatives of the loss with respect to the planes, [5, H, W].
         adam: State of Adam, which changes in place.
         rates: Learning rate of each column, [16] float32; needed with `adam`.
         needle_weight: Weight of the penalty on needles; see `Rasterizer.gradients`.

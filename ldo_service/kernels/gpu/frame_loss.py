@@ -1,4 +1,4 @@
-"""Loss between a rendering and the images of a keyframe, and its derivatives by the planes."""
+"""Loss between a rendering and a keyframe, and its derivatives with respect to the rendering."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -46,8 +46,8 @@ def image_loss(
         weights: Weights of L1, D-SSIM and depth.
 
     Returns:
-        dL/dplanes [5, H, W] on the device. Then L1, D-SSIM, depth error and squared error as means,
-        [4] float64.
+        dL/dplanes [5, H, W] on the device: red, green, blue, weighted depth, opacity. Then L1,
+        D-SSIM, depth error and squared error as means, [4] float64.
     """
     width, height, planes = rendering.width, rendering.height, rendering.planes
     pixels = width * height

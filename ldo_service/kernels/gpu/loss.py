@@ -2,7 +2,7 @@
 
 The loss compares x with y: x is the rendering with the exposure of the frame applied, y is the
 frame, both in 0..1. The window of SSIM, a Gaussian, is applied along rows, then along columns,
-first to the images and then to the derivatives of SSIM by the windowed means.
+first to the images and then to the derivatives of SSIM with respect to the windowed means.
 
 One lane computes one value of [3, H, W]. Its index there is `at`, and `pixel` is its index in
 [H, W]. `is_live` is false for lanes of the last program that have no value.
@@ -66,7 +66,7 @@ def means_along_rows(planes, color, mask, exposure, width, height, out, BLOCK: t
     """Apply the window along rows to x, y, x^2 + y^2 and x y; the module defines x and y.
 
     Args:
-        planes: Rendering, [5, H, W].
+        planes: Rendering, [5, H, W]: red, green, blue, weighted depth, opacity.
         color: Frame, [3, H, W] uint8.
         mask: Pixels that count, [H, W] uint8.
         exposure: Gains of the three channels, then biases, [2, 3].
@@ -112,8 +112,8 @@ def ssim_derivatives(along_rows, width, height, out, ssims, BLOCK: tl.constexpr)
         along_rows: Output of `means_along_rows`, [4, 3, H, W].
         width: W.
         height: H.
-        out: Output, [3, 3, H, W]: derivatives of SSIM by the windowed x, x^2 + y^2 and x y; the
-            module defines x and y.
+        out: Output, [3, 3, H, W]: derivatives of SSIM with respect to the windowed x, x^2 + y^2
+            and x y; the module defines x and y.
         ssims: Output, [programs]: sum of SSIM over the values of each program.
         BLOCK: Lanes of a program.
     """
@@ -167,10 +167,12 @@ def color_gradient(
     squares,
     BLOCK: tl.constexpr,
 ):
-    """Compute the derivatives by the color planes, and the sums of L1 and of the squared error.
+    """Compute the derivatives of the loss with respect to the rendered colors.
+
+    The kernel also sums L1 and the squared error.
 
     Args:
-        planes: Rendering, [5, H, W].
+        planes: Rendering, [5, H, W]: red, green, blue, weighted depth, opacity.
         color: Frame, [3, H, W] uint8.
         mask: Pixels that count, [H, W] uint8.
         exposure: Gains of the three channels, then biases, [2, 3].
@@ -179,7 +181,7 @@ def color_gradient(
         height: H.
         l1: Weight of L1, divided by the number of values 3 H W.
         d_ssim: Minus the weight of D-SSIM = 1 - SSIM, divided by the number of values.
-        by_planes: Output, [5, H, W], of which the color planes are written.
+        by_planes: Output, [5, H, W] like `planes`, of which the colors are written.
         l1s: Output, [programs]: sum of the absolute errors of each program.
         squares: Output, [programs]: sum of the squared errors of each program.
         BLOCK: Lanes of a program.
@@ -208,16 +210,18 @@ def color_gradient(
 def depth_gradient(
     planes, depth_m, mask, width, height, step, by_planes, errors, BLOCK: tl.constexpr
 ):
-    """Compute the derivatives by the planes of depth and opacity, and the sum of the errors.
+    """Compute the derivatives of the loss with respect to the rendered depth and opacity.
+
+    Those with respect to the opacity are 0. The kernel also sums the depth errors.
 
     Args:
-        planes: Rendering, [5, H, W].
+        planes: Rendering, [5, H, W]: red, green, blue, weighted depth, opacity.
         depth_m: Depth of the frame, [H, W]; 0 where not measured.
         mask: Pixels that count, [H, W] uint8.
         width: W.
         height: H.
         step: Weight of the depth error, divided by the number of depths that count.
-        by_planes: Output, [5, H, W], of which the last two planes are written.
+        by_planes: Output, [5, H, W] like `planes`, of which depth and opacity are written.
         errors: Output, [programs]: sum of the depth errors of each program.
         BLOCK: Lanes of a program.
     """

@@ -1,4 +1,4 @@
-"""Rendering of the image planes of an optimizer iteration.
+"""Rendering of color, depth and opacity in an iteration of the Gaussian optimizer.
 
 Arrays of the device come from an `Arrays`. No kernel uses atomic operations: each program writes
 its own values, and the host adds sums of programs in a fixed order. The results are therefore
@@ -86,7 +86,7 @@ class TileLists:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PlaneRendering:
-    """Rendered planes, and everything that their derivatives need.
+    """Rendered image planes, and everything that their derivatives need.
 
     Attributes:
         view: Output of `view_of`, on the device.
@@ -95,7 +95,7 @@ class PlaneRendering:
         height: Height of the image, pixels.
         splats: Projected Gaussians.
         lists: Pairs of splats and tiles.
-        planes: [5, height, width].
+        planes: [5, height, width]: red, green, blue, weighted depth, opacity.
         ends: For the 16 blocks of each tile, the index of the pair after the last blended one,
             [tiles, 16].
     """

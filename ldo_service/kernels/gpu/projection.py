@@ -31,7 +31,9 @@ def camera_of(view, width, height):
     """Return the rows of the rotation, the translation, the lens, the limits and the filter.
 
     The lens is (fx, fy, cx, cy). The limits bound x / z and y / z where the projection is
-    linearized. The filter is (low_pass, box), in px^2.
+    linearized. The filter is (low_pass, box), two variances in px^2: low_pass is added to the
+    covariance of each splat, and box is the part of it due to the averaging of pixels. The module
+    describes the layout of `view`.
     """
     R0 = (tl.load(view), tl.load(view + 1), tl.load(view + 2))
     R1 = (tl.load(view + 4), tl.load(view + 5), tl.load(view + 6))
@@ -56,12 +58,12 @@ def to_camera(mean, R0, R1, R2, t):
 
 @triton.jit
 def jacobian(p, R0, R1, R2, lens, limits):
-    """Return the derivatives of u and v by a point of the map, and the values that they share.
+    """Return the derivatives of u and v with respect to a point of the map, and shared values.
 
     The point p is in the camera frame; `camera_of` describes the other arguments. The shared values
-    are 1 / z, x / z, y / z and (ju, jv, ku, kv). By the point in the camera frame, the derivative
-    of u is (ju, 0, -ku), and that of v is (0, jv, -kv). The viewing direction is clamped to
-    `limits`, because the affine model fails farther outside.
+    are 1 / z, x / z, y / z and (ju, jv, ku, kv). With respect to the point in the camera frame, the
+    derivative of u is (ju, 0, -ku), and that of v is (0, jv, -kv). The viewing direction is clamped
+    to `limits`, because the affine model fails farther outside.
     """
     inverse_z = tl.div_rn(1.0, tl.maximum(p[2], NEAR))
     x, y = p[0] * inverse_z, p[1] * inverse_z
@@ -216,7 +218,7 @@ def depth_keys(splats, visible, n, keys, BLOCK: tl.constexpr):
     """Write a key for each visible splat, by which integers sort like the depths.
 
     Args:
-        splats: [N, 16].
+        splats: [N, 16]; the module describes the layout.
         visible: Rows that are drawn, [n].
         n: Number of these rows.
         keys: Output, [n] int32: bits of the depth. They sort like it, because depths are positive.
@@ -241,7 +243,7 @@ def list_pairs(
     """Compute the tile of each pair, and the blocks of 4x4 pixels that its splat reaches.
 
     Args:
-        splats: [N, 16].
+        splats: [N, 16]; the module describes the layout.
         ranges: Tiles of each splat, [N, 4].
         owners: Splat of each pair, [n_pairs]; the tiles of a splat are taken row by row.
         firsts: First pair of each splat, [N].

@@ -18,7 +18,7 @@ from .projection import (
 
 @triton.jit
 def quaternion_gradient(q, g0, g1, g2):
-    """Return the derivatives by a quaternion of any length, from those by the rotation's columns.
+    """Convert derivatives from the columns of a rotation to its quaternion of any length.
 
     The length of the quaternion has no effect, so the radial part of the gradient is removed.
     """
@@ -43,7 +43,7 @@ def quaternion_gradient(q, g0, g1, g2):
 
 @triton.jit
 def needle_gradient(scale, push, log_ratio):
-    """Return the derivatives of the needle penalty by the log scales.
+    """Return the derivatives of the needle penalty with respect to the log scales.
 
     The penalty is push max(0, log(longest / middle axis) - log_ratio). `push` is the weight of the
     penalty times the mean blending weight of the Gaussian over the pixels.
@@ -93,15 +93,15 @@ def sums_of_pairs(sums, first, count, BLOCK: tl.constexpr):
 
 @triton.jit
 def store_pose(by_pose, p, g, perspective, row_u, row_v, is_live):
-    """Store the derivatives by the pose, summed over all Gaussians of the program.
+    """Store the derivatives with respect to the pose, summed over the Gaussians of the program.
 
     Args:
         by_pose: Output, [programs, 8]: by rotation (3), by translation (3), and two zeros.
         p: Point in the camera frame.
-        g: Derivative by this point.
+        g: Derivative with respect to this point.
         perspective: (ju, jv, ku, kv); see `projection.jacobian`.
-        row_u: Derivative by the row of u of the Jacobian, in the camera frame.
-        row_v: Derivative by the row of v.
+        row_u: Derivative with respect to the row of u of the Jacobian, in the camera frame.
+        row_v: Derivative with respect to the row of v.
         is_live: True for lanes that have a Gaussian.
     """
     ju, jv, ku, kv = perspective
@@ -126,7 +126,7 @@ def take_step(
     Args:
         rows: Gaussians, [N, 16].
         i: Row of each lane.
-        gradient: Derivatives by the columns; the last one is 0.
+        gradient: Derivatives with respect to the columns; the last one is 0.
         is_live: True for lanes that have a Gaussian.
         camera: Third row of the rotation of T_camera_map, and its translation.
         state: Moments, squares and steps; see `project_backward`.
@@ -206,8 +206,8 @@ def project_backward(
         firsts: First row of `sums` of each splat, [N].
         pairs: Number of rows of `sums` of each splat, one for each of its tiles, [N].
         sums: Output of `blend_backward`, [P, 16].
-        by_rows: Output without ADAM, [n_visible, 16]: derivatives by the rows. Column 14 is the
-            blending weight summed over the pixels.
+        by_rows: Output without ADAM, [n_visible, 16]: derivatives with respect to the rows. Column
+            14 is the blending weight summed over the pixels.
         moments: First moments, [N, 16]; changed with ADAM.
         squares: Second moments, [N, 16]; changed with ADAM.
         steps: Number of steps of each row, [N]; changed with ADAM.
@@ -220,8 +220,8 @@ def project_backward(
         needle_log_ratio: Logarithm of the axis ratio above which the penalty applies.
         max_sigma_per_depth: Maximum standard deviation per meter of depth after the step.
         weights: Output, [n_visible]: blending weight of each row summed over the pixels.
-        by_pose: Output, [programs, 8]: derivatives by xi of T_map_camera exp(xi), rotation first,
-            then two zeros; to be summed over the programs.
+        by_pose: Output, [programs, 8]: derivatives with respect to xi of T_map_camera exp(xi),
+            rotation first, then two zeros; to be summed over the programs.
         LAST_STEP: Number of steps after which the correction stays constant.
         ADAM: Take a step of Adam, instead of writing the derivatives.
         BLOCK: Lanes of a program.
