@@ -1,7 +1,7 @@
 """Foreground of a new keyframe, in front of the background that older keyframes measured.
 
 A person who stands still for a while looks static compared with the last frames. Older keyframes
-that show the wall behind the person prove that the person is not. Conventions:
+that show the wall behind the person prove that the person is a moving object. Conventions:
 `ldo_service.geometry`.
 """
 

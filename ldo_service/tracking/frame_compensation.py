@@ -78,8 +78,8 @@ class FrameCompensator:
 
         The frame was compensated for the expected motion. If the measured motion differs from it by
         more than `ShutterConfig.realign_ratio`, the frame is compensated again and aligned again.
-        Up to `max_linear_ratio`, this is saved for OK frames that become no keyframe: their pose is
-        corrected to first order instead.
+        OK frames that become no keyframe are spared this up to `max_linear_ratio`: their pose is
+        only corrected, to first order.
 
         Args:
             frame: The frame of the last call of `expect`.

@@ -93,7 +93,9 @@ class Relay:
     def pose_of(
         self, T_relay_camera: np.ndarray, information: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Convert a pose relative to the relay into a pose relative to its keyframe.
+        """Convert a pose relative to the relay into a pose relative to the last keyframe before it.
+
+        A relay is a frame that later frames are aligned to although it is no keyframe.
 
         Args:
             T_relay_camera: Pose of the camera relative to the relay, [4, 4].
@@ -128,7 +130,8 @@ class ReferenceKeyframe:
     # are not used.
     id: int
     submap: int = 0  # Submap in whose odometry frame T_odom_keyframe is expressed.
-    # Pixels whose surface has moved, [H, W] bool at working resolution; found by `segment_motion`.
+    # Pixels whose surface has moved, [H, W] bool at the finest pyramid level; found by
+    # `segment_motion`.
     moved_mask: np.ndarray | None = None
     ignore_mask: np.ndarray | None = None  # `moved_mask` grown by `grow_mask`, [H, W] bool.
     dynamic_class_mask: np.ndarray | None = None  # Objects of dynamic classes, [H, W] bool.
@@ -321,7 +324,7 @@ def limit_ratios(
 def keyframe_dynamic_class_mask(
     view: Pyramid, boxes: Sequence[Box], config: DynamicClassConfig
 ) -> np.ndarray:
-    """Return the mask of detected objects of dynamic classes, at working resolution.
+    """Return the mask of detected objects of dynamic classes, at the finest pyramid level.
 
     Args:
         view: Pyramid of the keyframe.

@@ -100,13 +100,13 @@ class MotionEvidence:
         return is_of_keyframe and self.contradicts.shape == now.depth_m.shape
 
     def of_new_keyframe(self) -> "MotionEvidence":
-        """Return the state for a new keyframe: the counts in `gone` restart at zero."""
+        """Return the state for a new keyframe, none of whose points has disappeared yet."""
         return MotionEvidence(self.contradicts, None)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MotionMasks:
-    """Result of motion segmentation, at working resolution: that of the finest pyramid level."""
+    """Result of motion segmentation, at the finest pyramid level."""
 
     # Pixels of the frame that show moving objects, [H, W] bool.
     dynamic_mask: np.ndarray
@@ -236,11 +236,12 @@ def foreground_mask(
         noise_scale: Factor on the depth noise, as estimated by alignment.
         config: Settings.
         noise: Depth noise of the camera.
-        dynamic_mask: Dynamic pixels of the frame, [H, W] bool at working resolution.
+        dynamic_mask: Dynamic pixels of the frame, [H, W] bool at the finest pyramid level.
 
     Returns:
-        [H, W] bool at working resolution. None if too few of the pixels that are not dynamic agree
-        with the keyframe, because T_keyframe_camera is wrong or the keyframe shows another surface.
+        [H, W] bool at the finest pyramid level. None if too few of the pixels that are not dynamic
+        agree with the keyframe, because T_keyframe_camera is wrong or the keyframe shows another
+        surface.
     """
     now, then = _level(view, config), _level(keyframe, config)
     pair = _Pair(now, then, T_keyframe_camera, noise, noise_scale, config)
@@ -261,7 +262,7 @@ def grow_mask(
     Do not pass the grown mask to `segment_motion`, since the mask would grow from frame to frame.
 
     Args:
-        dynamic_mask: Mask of `segment_motion`, [H, W] bool at working resolution.
+        dynamic_mask: Mask of `segment_motion`, [H, W] bool at the finest pyramid level.
         view: Pyramid of the image that the mask belongs to.
         config: Settings.
 

@@ -8,11 +8,12 @@ is therefore computed as
     scale (H^-1 S H^-1 + max(tr(H^-1 S) / 6, 1) H^-1) + floor,
 
 where S is the sum of g g^T, and g is the gradient of the color or of the depth residuals of one
-cell of the image at the pose. The first term is the sandwich estimator (Liang and Zeger,
-"Longitudinal data analysis using generalized linear models", 1986). It grows where cells, or color
-and depth, contradict each other. The second term has the shape of H^-1 and the mean size of the
-first one. It covers directions in which the few gradients are small by coincidence. Its factor is
-at least 1, the value for independent residuals. `PRIOR` makes H regular.
+cell of the image at the pose. `CovarianceConfig` sets the factor `scale` and the standard
+deviations of the diagonal matrix `floor`. The first term is the sandwich estimator (Liang and
+Zeger, "Longitudinal data analysis using generalized linear models", 1986). It grows where cells, or
+color and depth, contradict each other. The second term has the shape of H^-1 and the mean size of
+the first one. It covers directions in which the few gradients are small by coincidence. Its factor
+is at least 1, the value for independent residuals. `PRIOR` makes H regular.
 
 Errors that all cells have in common do not show in the spread of the cells. An example is a depth
 bias that looks like a rotation. Color and depth then favor different poses, so `contradiction`
@@ -50,8 +51,8 @@ class CovarianceConfig:
     and 11.1. See docs/benchmarks/covariance.md.
     """
 
-    scale: float = 5.0  # Factor on both terms; see the docstring of the module.
-    # Standard deviations of the floor: errors of the linear interpolation of images.
+    scale: float = 5.0  # Factor on the covariance, before the floor is added.
+    # Minimum standard deviations: errors of the linear interpolation of images.
     floor_rad: float = 3e-5
     floor_m: float = 5e-5
 

@@ -219,7 +219,7 @@ def build_reference(pyramid: Pyramid, ignore_mask: np.ndarray | None = None) -> 
 
     Args:
         pyramid: Pyramid of the keyframe.
-        ignore_mask: Pixels to ignore, [H, W] bool at working resolution.
+        ignore_mask: Pixels to ignore, [H, W] bool at the finest pyramid level.
     """
     levels = (_without(level, ignore_mask) for level in pyramid.levels)
     points = tuple(_level_points(level, i) for i, level in enumerate(levels))

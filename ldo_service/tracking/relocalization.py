@@ -66,8 +66,7 @@ PosedRecord = tuple[KeyframeRecord, FeaturePose]
 class RelocalizationConfig:
     """Settings of relocalization."""
 
-    # Number of records that a frame is compared with: those with the most similar thumbnails. The
-    # prototype has the same value.
+    # Number of records that a frame is compared with: those with the most similar thumbnails.
     appearance_candidates: int = 5
     # Number of further records that a frame is compared with. The next search uses the next
     # ones. All of 1000 records have had their turn after 11 s at 30 Hz.
@@ -77,7 +76,7 @@ class RelocalizationConfig:
     across_scales: int = 8
     # Maximum number of direct alignments per search, from the feature poses with most inliers.
     attempts: int = 3
-    # Minimum inlier fraction of the points paired with a measured depth; value of the prototype.
+    # Minimum inlier fraction of the points paired with a measured depth.
     min_geometric_inliers: float = 0.85
     # Maximum rotation plus parallax between the feature pose and the pose by alignment.
     agreement_rad: float = 0.06
@@ -148,7 +147,8 @@ class Relocalizer:
         Args:
             view: Pyramid of the frame.
             database: Keyframe database to search.
-            turn: Number of searches before this one. It selects which further records are tried.
+            turn: Number of searches before this one. It selects the records that are tried besides
+                the most similar and the newest ones.
             history: Residual noise of the last frames, for records that store none.
             is_lost: True allows the search by SIFT, which is too slow while tracking works.
 
@@ -285,8 +285,8 @@ Nearby = tuple[KeyframeRecord, np.ndarray]
 class KeyframeReuseConfig:
     """Settings of keyframe reuse."""
 
-    # Known keyframes are reused once this many keyframes have been made, including mapping
-    # keyframes; 0: never. Before that, new keyframes improve the map and cost a few kB each.
+    # Known keyframes are reused once this many keyframes of any kind have been made; 0: never.
+    # Before that, new keyframes improve the map and cost a few kB each.
     after: int = 1500
     # Maximum number of records that a frame is aligned to, the nearest first. Each one takes 8
     # ms at 640x480.

@@ -76,22 +76,24 @@ class ShutterState:
     """
 
     timing: ShutterTiming = field(default_factory=ShutterTiming)  # Timing that is compensated.
-    evidence: TimingEvidence = field(default_factory=TimingEvidence)
+    evidence: TimingEvidence = field(default_factory=TimingEvidence)  # Evidence for it.
     # Mean velocity between the last two frames that have a pose, [6]; None if unknown.
     mean_velocity: np.ndarray | None = None
     # Velocity at the reference keyframe, [6]: the mean of the velocities before and after it. None
     # if unknown, and at the frame after a new reference.
     reference_velocity: np.ndarray | None = None
     has_new_reference: bool = False  # True if the last frame became the reference.
-    # Equations of the last frame. They wait for the next frame, which shows the velocity at the
-    # last one.
+    # Normal equations of the last frame, not yet in `evidence`. They wait for the next frame, which
+    # shows the velocity at the last one.
     pending: BandEquations | None = None
 
     def informed(self, equations: np.ndarray | None, config: ShutterConfig) -> "ShutterState":
         """Return the state with the self-calibration's estimate as the prior of the times.
 
+        The times are the readout of color, the readout of depth and the delay of depth.
+
         Args:
-            equations: Normal equations of the times of the shutter, [3, 4]; see
+            equations: Normal equations of the three times in seconds, [3, 4]; see
                 `CameraKnowledge.timing`. None if unknown.
             config: Settings.
         """
@@ -135,8 +137,8 @@ class ShutterState:
     def moved(self, motion: FrameMotion, config: ShutterConfig) -> "ShutterState":
         """Return the state after a frame with a known motion.
 
-        The motion also shows the velocity at the frame before. With it, the pending equations of
-        that frame are added to the evidence.
+        The motion also shows the velocity at the frame before. Only with it can the residuals of
+        that frame (`pending`) become evidence for the times of the shutter.
         """
         mean, earlier, state = motion.velocity, self.mean_velocity, self
         if earlier is not None:
@@ -158,9 +160,9 @@ class ShutterState:
         return replace(self, reference_velocity=None, has_new_reference=True)
 
     def recorrected(self) -> "ShutterState":
-        """Return the state after the correction of the images was replaced.
+        """Return the state after the camera correction (vignetting, depth bias) was replaced.
 
-        Earlier evidence then counts less.
+        Earlier evidence for the times of the shutter then counts less.
         """
         return replace(self, evidence=self.evidence.scaled(EARLIER_WEIGHT), pending=None)
 

@@ -188,14 +188,14 @@ def band_equations(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TimingEvidence:
-    """Sums of the timing equations of many frames, in groups with equal numbers of frames."""
+    """Sums of the timing equations of many frames, in groups of equally many successive frames."""
 
     groups: tuple[np.ndarray, ...] = ()  # [3, 4] each: information | right side, in order of time.
     size: int = 1  # Frames per complete group.
     in_last: int = 0  # Frames in the last group.
     count: int = 0  # Frames in all groups.
-    # Prior of the times as information and right side, [3, 4]: an estimate from other evidence, or
-    # `PRIOR`.
+    # Prior of the times as information and right side, [3, 4]: the estimate of the
+    # self-calibration, or `PRIOR` before it: usual times.
     prior: np.ndarray = field(default_factory=PRIOR.copy)
 
     def extended(self, measurement: np.ndarray) -> "TimingEvidence":
@@ -217,10 +217,11 @@ class TimingEvidence:
         The times are the readout times of color and depth, and the delay of depth.
 
         The prior determines those times that the frames do not. The variances are the sum of two
-        estimates. One is a jackknife over the groups, which allows for the similar errors of
-        neighboring frames. The other follows from the information of the equations, because a
-        jackknife over few groups may be small by chance. With fewer than `MIN_GROUPS` groups of
-        frames, the result is that of the prior alone, or None if the prior is still `PRIOR`.
+        estimates. One is a jackknife over the groups of successive frames, which allows for the
+        similar errors of neighboring frames. The other follows from the information of the
+        equations, because a jackknife over few groups may be small by chance. With fewer than
+        `MIN_GROUPS` groups, the result is that of the prior alone, or None if no estimate has
+        replaced the initial prior.
         """
         if len(self.groups) < MIN_GROUPS:
             if np.array_equal(self.prior, PRIOR):

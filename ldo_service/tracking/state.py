@@ -58,7 +58,7 @@ class OdometryState:
     submaps: Submaps = field(default_factory=Submaps)
     # Pose of the last mapped frame, [4, 4].
     T_odom_last_mapped: np.ndarray = field(default_factory=lambda: np.eye(4))
-    # Dynamic pixels of the last frame, [H, W] bool at working resolution; None if unknown.
+    # Dynamic pixels of the last frame, [H, W] bool at the finest pyramid level; None if unknown.
     dynamic_mask: np.ndarray | None = None
     motion_evidence: MotionEvidence | None = None
     # Poses of the last OK frame in odometry and in the odometry prior; None if the prior had no

@@ -114,8 +114,9 @@ class TrackingQualityConfig:
 class ResidualHistory:
     """Photometric and geometric noise of the last OK frames, oldest first."""
 
-    intensity_sigmas: tuple[float, ...] = ()  # Gray levels of the reference image.
-    depth_noise_scales: tuple[float, ...] = ()  # Multiples of `DepthNoise`.
+    # Photometric noise, in gray levels as the image of the reference keyframe has them.
+    intensity_sigmas: tuple[float, ...] = ()
+    depth_noise_scales: tuple[float, ...] = ()  # Geometric noise, multiples of `DepthNoise`.
 
     def extended(self, alignment: Alignment, config: TrackingQualityConfig) -> "ResidualHistory":
         """Return the history with the noise of one more alignment.

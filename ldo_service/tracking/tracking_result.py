@@ -50,7 +50,7 @@ class TrackedFrame:
     # `PoseHypothesis`.
     hypothesis_spread_rad: float = 0.0
     is_contradictory: bool = False  # True if color and depth contradict each other.
-    # Dynamic pixels, which are not mapped, [H, W] bool at working resolution.
+    # Dynamic pixels, which are not mapped, [H, W] bool at the finest pyramid level.
     dynamic_mask: np.ndarray | None = None
     needed_keyframe: KeyframeKind | None = None  # Set for OK frames only.
     should_start_submap: bool = False  # True if LOST for so long that a new submap should start.
@@ -79,7 +79,7 @@ class TrackedFrame:
             pose_source: Name of the initial guess that the alignment started from.
             needed_keyframe: The kind of keyframe that the frame should become; None if none.
             hypothesis_spread_rad: Distance to the farthest other pose that the images support.
-            dynamic_mask: Dynamic pixels, [H, W] bool at working resolution; None if unknown.
+            dynamic_mask: Dynamic pixels, [H, W] bool at the finest pyramid level; None if unknown.
         """
         T_reference_camera, information = alignment.T_reference_camera, alignment.information
         if keyframe.relay is not None:
@@ -158,7 +158,7 @@ class TrackingResult:
     # `PoseHypothesis`.
     hypothesis_spread_rad: float
     is_contradictory: bool  # True if color and depth contradict each other.
-    # Dynamic pixels, which are not mapped, [H, W] bool at working resolution.
+    # Dynamic pixels, which are not mapped, [H, W] bool at the finest pyramid level.
     dynamic_mask: np.ndarray | None
     has_prior: bool  # True if the odometry prior covers the time of the frame.
     # Motion of the camera during the frame, which is compensated; None if unknown.
@@ -169,9 +169,9 @@ class TrackingResult:
     keyframe: NewKeyframe | None = None  # Keyframe made of the frame; None if none was made.
     # Id of a known keyframe that is the reference from now on; None if none is reused.
     reused_keyframe: int | None = None
-    # Kind of keyframe that was needed but not allowed by `may_map`; None otherwise.
+    # Kind of keyframe that was needed but not allowed (`Odometry.process`, `may_map`), or None.
     denied_keyframe: KeyframeKind | None = None
-    # True if odometry has not started yet because `may_map` was False at its first frame.
+    # True if odometry has not started yet, because no keyframe of its first frame was allowed.
     awaits_mapping: bool = False
 
 
@@ -203,9 +203,10 @@ def make_tracking_result(
         shutter: Timing of the shutter after the frame.
         keyframe: The new keyframe made of the frame; None if none was made.
         reused_keyframe: Id of the known keyframe that is the reference from now on; None if none.
-        denied_keyframe: Kind of keyframe that was needed but not allowed by `may_map`, or None.
-        awaits_mapping: True if odometry has not started, because `may_map` did not allow a keyframe
-            of its first frame.
+        denied_keyframe: Kind of keyframe that was needed but that the caller of `Odometry.process`
+            did not allow; None otherwise.
+        awaits_mapping: True if odometry has not started, because the caller did not allow a
+            keyframe of its first frame.
     """
     return TrackingResult(
         status=tracked.status,
