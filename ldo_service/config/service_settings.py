@@ -104,6 +104,7 @@ class OfflineSettings:
 
     # Maximum fraction of frames that cannot be read. The run fails above this fraction.
     max_rejected_ratio: Ratio = 0.1
+    # Simulated latency of the actors other than the tracker.
     latency_frames: LatencySettings = field(default_factory=LatencySettings)
 
 

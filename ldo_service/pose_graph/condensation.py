@@ -116,9 +116,12 @@ class CondensedKeyframes:
         return keyframes[order], np.concatenate([T_map_variable, T_map])[order]
 
     def moved(self, row: int, T_head_keyframe: np.ndarray) -> "CondensedKeyframes":
-        """Return the condensed keyframes with a new T_head_keyframe [4, 4] in one row.
+        """Return the keyframes with one of them moved relative to the variables at its two ends.
 
-        T_tail_keyframe of the row changes accordingly.
+        Args:
+            row: Row of the moved keyframe.
+            T_head_keyframe: Its new pose relative to its head, the variable before it, [4, 4]. Its
+                pose relative to its tail, the variable after it, changes accordingly.
         """
         T_tail_head = self.T_tail[row] @ np.linalg.inv(self.T_head[row])
         T_head, T_tail = self.T_head.copy(), self.T_tail.copy()
