@@ -156,7 +156,7 @@ class SelfCalibration:
 
     @property
     def knowledge(self) -> CameraKnowledge:
-        """Uncertainty of the depth bias and timing of the shutter, to track the next frame."""
+        """What tracking needs to know: sigma of the depth bias, and estimated shutter timing."""
         relative = 1.0
         if not self.is_undecided:
             covariance = self.depth_bias_covariance * DEPTH_PRIOR
@@ -388,11 +388,11 @@ class SelfCalibration:
         }
 
     def evidence(self) -> dict[str, float]:
-        """Return residual ratios, covariance of the depth bias (1/m^2), `Extrinsics.metrics`."""
+        """Return metrics that say how well the data support each estimate."""
         return {
             # 1 after the estimate from all views.
             "calibration_finished": float(self.is_finished),
-            # Held-out residuals of the last estimate, relative to those without a correction.
+            # Held-out residuals with the correction, divided by those without it.
             "depth_bias_residual_ratio": self.ratios[0],
             "vignetting_residual_ratio": self.ratios[1],
             **{name: float(self.depth_bias_covariance[at]) for name, at in BIAS_COVARIANCE.items()},

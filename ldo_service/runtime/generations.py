@@ -56,7 +56,10 @@ def completed_generation(store: FolderStore) -> int | None:
 
 
 def complete_generation(store: FolderStore, number: int) -> None:
-    """Write the number of a complete generation to the disk, and the actors that it contains.
+    """Write the marker file: the number of the last generation whose states are all on the disk.
+
+    A generation has copies of the states of all actors at one time. The marker also lists the
+    actors that have a state in it.
 
     Raises:
         OSError: The disk is full or cannot be written. The marker file may have the number already.

@@ -50,7 +50,7 @@ LANDMARK = np.dtype(
 
 
 def new_landmarks(n: int, keyframe: int) -> np.ndarray:
-    """Return n candidates without members, first observed in `keyframe`."""
+    """Return n candidates for objects, first observed in `keyframe`, without Gaussians."""
     table = np.zeros(n, LANDMARK)
     table["id"] = table["view_keyframes"] = NO_MEMBER
     table["members"], table["T_map_object"] = NO_MEMBER, np.eye(4)
