@@ -156,7 +156,7 @@ class SelfCalibration:
 
     @property
     def knowledge(self) -> CameraKnowledge:
-        """What tracking needs to know: sigma of the depth bias, and estimated shutter timing."""
+        """Sigma of the depth bias and estimated timing of the shutter, to track the next frame."""
         relative = 1.0
         if not self.is_undecided:
             covariance = self.depth_bias_covariance * DEPTH_PRIOR

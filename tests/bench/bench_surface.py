@@ -95,16 +95,18 @@ def samples_of_frame(frame: RgbdFrame, T_world_camera: np.ndarray) -> Samples:
     )
 
 
-def true_surface(sequence: Sequence, truth: Trajectory, every: int) -> Samples:
+def true_surface(sequence: Sequence, truth: Trajectory, every: int, until_s: float) -> Samples:
     """Return samples of the surface that the depth images of a sequence show.
 
     Args:
         sequence: A sequence with exact depth.
         truth: The true poses at the stamps of its frames.
         every: Use every n-th frame.
+        until_s: Stamp of the last frame of the run, seconds.
     """
     surface: list[Samples] = []
-    for index in range(0, len(sequence), every):
+    used = int(np.searchsorted(sequence.stamps_ns, until_s * 1e9 + 1e3))
+    for index in range(0, used, every):
         frame = sequence[index]
         nearest = int(np.argmin(abs(truth.stamps_s - frame.stamp_ns / 1e9)))
         part = samples_of_frame(frame, truth.T_world_camera[nearest])
@@ -151,7 +153,8 @@ def main() -> None:
     truth = sequence.truth()
     if truth is None:
         parser.error(f"{arguments.source} has no true poses. Give a source with exact truth.")
-    T_truth_map = evaluate_trajectory(source.trajectory(), truth).T_truth_estimate
+    trajectory = source.trajectory()
+    T_truth_map = evaluate_trajectory(trajectory, truth).T_truth_estimate
     mesh = fuse(
         source.gaussians(), source.viewpoints(), TsdfConfig(arguments.voxel), threads=2
     ).mesh()
@@ -160,7 +163,7 @@ def main() -> None:
     mapped = Samples(
         se3.transform(T_truth_map, mapped.points_m), mapped.normals @ T_truth_map[:3, :3].T
     )
-    true = true_surface(sequence, truth, arguments.every)
+    true = true_surface(sequence, truth, arguments.every, trajectory.stamps_s[-1])
     print(f"mesh: {mesh.area_m2:.1f} m2; true surface: {len(true.points_m):,} samples")
     print("accuracy:", summary(distances_m(chosen_points(mapped, rng), true)))
     print("completeness:", summary(distances_m(chosen_points(true, rng), mapped.thinned())))
