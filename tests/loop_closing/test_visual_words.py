@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ldo_service.errors import ConfigError
-from ldo_service.loop_closing.loop_detector import VisualWords, VisualWordsConfig
+from ldo_service.loop_closing.visual_words import VisualWords, VisualWordsConfig
 
 
 def flipped(descriptors: np.ndarray, bits: int, rng: np.random.Generator) -> np.ndarray:
