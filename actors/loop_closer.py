@@ -5,6 +5,7 @@ Topics, their messages, the delivery policy of each input (with its queue length
 in   keyframe/new       Keyframe         Backlog(4)    a lost keyframe could never close a loop
 in   detection/boxes    DetectionBoxes   Backlog(16)   object classes in every keyframe
 in   graph/correction   GraphCorrection  Latest(1)     has all poses, so the newest suffices
+in   map/objects        MapObjects       Latest(1)     has all objects, so the newest suffices
 out  loop/closure       LoopClosure                    each accepted candidate
 out  loop/candidate     LoopCandidate                  each candidate, with a reason if rejected
 
@@ -22,13 +23,14 @@ import numpy as np
 
 from ldo_service.conversions.frames import keyframe_from_message
 from ldo_service.conversions.loops import loop_candidate_to_message, loop_closure_to_message
-from ldo_service.conversions.objects import scale_boxes
+from ldo_service.conversions.objects import landmarks_from_message, scale_boxes
 from ldo_service.conversions.poses import keyframe_poses_from_correction, pose_from_message
 from ldo_service.detection.dynamic_classes import DynamicClassConfig, dynamic_class_mask
 from ldo_service.detection.vocabulary import Vocabulary
 from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.loop_closing import LoopCandidateResult, LoopDetector, LoopsConfig
 from ldo_service.loop_closing.object_points import DetectionPoints, locate_detections
+from ldo_service.loop_closing.object_presence import MapLandmarks
 from ldo_service.runtime import Actor, Backlog, In, Latest, Out
 from ldo_service.schemas import (
     Detection,
@@ -37,6 +39,7 @@ from ldo_service.schemas import (
     Keyframe,
     LoopCandidate,
     LoopClosure,
+    MapObjects,
 )
 from ldo_service.schemas.message import decode, encode
 from ldo_service.schemas.topics import (
@@ -45,6 +48,7 @@ from ldo_service.schemas.topics import (
     KEYFRAME_NEW,
     LOOP_CANDIDATE,
     LOOP_CLOSURE,
+    MAP_OBJECTS,
 )
 from ldo_service.tracking.keyframe_database import KeyframeRecord, make_keyframe_record
 
@@ -93,6 +97,7 @@ class LoopCloser(Actor):
         In(KEYFRAME_NEW, Backlog(4)),
         In(DETECTION_BOXES, Backlog(16)),
         In(GRAPH_CORRECTION, Latest(1)),
+        In(MAP_OBJECTS, Latest(1)),
     )
     outputs = (Out(LOOP_CLOSURE, is_final=True), Out(LOOP_CANDIDATE, is_final=True))
     is_backend = True
@@ -111,6 +116,7 @@ class LoopCloser(Actor):
         self._waiting: dict[int, PendingKeyframe] = {}  # Pending keyframes by id.
         # Detections that arrived before their keyframe or wait together with it, by keyframe id.
         self._boxes: dict[int, DetectionBoxes] = {}
+        self._objects = MapLandmarks.none()  # Objects of the map, as last published.
         self._newest = -1  # Id of the newest received keyframe.
         self._accepted = self._refused = self._without_boxes = self._repeated = 0
         self._parts: dict[str, Any] | None = None  # Cached parts of the state.
@@ -118,7 +124,7 @@ class LoopCloser(Actor):
         self._saved_poses: dict[str, Any] | None = None
 
     def handle(
-        self, message: Keyframe | DetectionBoxes | GraphCorrection
+        self, message: Keyframe | DetectionBoxes | GraphCorrection | MapObjects
     ) -> Iterator[LoopClosure | LoopCandidate]:
         """Yield the loop candidates and closures of keyframes that can be processed now.
 
@@ -132,6 +138,9 @@ class LoopCloser(Actor):
             self.poses.correct(message.graph_version, T_map)
             self._saved_poses = None
             self._merged_submaps = dict(message.merged_submaps)
+            return
+        if isinstance(message, MapObjects):
+            self._objects = landmarks_from_message(message, self.config.movable.classes)
             return
         if isinstance(message, Keyframe):
             self._take(message)
@@ -181,7 +190,13 @@ class LoopCloser(Actor):
         self._without_boxes += boxes is None
         place, sightings = self._masked_keyframe(waiting, boxes)
         results = self.recognizer.add(
-            place, waiting.frame, waiting.stamp_ns, sightings, self.poses, self._merged_submaps
+            place,
+            waiting.frame,
+            waiting.stamp_ns,
+            sightings,
+            self.poses,
+            self._merged_submaps,
+            self._objects,
         )
         yield from self._to_messages(results)
         if not self.recognizer.is_open or keyframe % RECENT_KEYFRAMES == 0:
@@ -239,14 +254,17 @@ class LoopCloser(Actor):
     def on_idle(self) -> Iterator[LoopClosure | LoopCandidate]:
         """Compare the unfinished subgraph with earlier subgraphs while the camera stands still."""
         self._parts = None
-        yield from self._to_messages(self.recognizer.flush(self.poses, self._merged_submaps))
+        yield from self._to_messages(self._flush())
 
     def on_stop(self) -> Iterator[LoopClosure | LoopCandidate]:
         """Search for loop closures of the pending keyframes and of the unfinished subgraph."""
         self._parts = None
         for keyframe in list(self._waiting):
             yield from self._recognize(keyframe)
-        yield from self._to_messages(self.recognizer.flush(self.poses, self._merged_submaps))
+        yield from self._to_messages(self._flush())
+
+    def _flush(self) -> list[LoopCandidateResult]:
+        return self.recognizer.flush(self.poses, self._merged_submaps, self._objects)
 
     def _needed(self) -> list[int]:
         """Return the ids of the keyframes whose poses must be kept.
@@ -262,7 +280,7 @@ class LoopCloser(Actor):
         """Return the state in parts that are written only when they change.
 
         Each subgraph, each keyframe of the unfinished subgraph and each pending keyframe is a part.
-        Three more parts are the visual words, the keyframe poses, and the rest.
+        Four more parts are the visual words, the keyframe poses, the objects, and the rest.
         """
         if self._parts is None:
             self._parts = self._all_parts()
@@ -282,7 +300,9 @@ class LoopCloser(Actor):
             "joined": list(self._merged_submaps.items()),
             "vocabulary": self._vocabulary.pack(),
         }
-        return {**subgraphs, **views, **waiting, **words, **self._poses_part(), "now": now}
+        objects = {"objects": self._objects.pack()}  # The same object until the next message.
+        parts = {**subgraphs, **views, **waiting, **words, **objects}
+        return {**parts, **self._poses_part(), "now": now}
 
     def _poses_part(self) -> dict[str, Any]:
         """Return the part of the state with the keyframe poses.
@@ -310,6 +330,8 @@ class LoopCloser(Actor):
         }
         boxes = [decode(body, DetectionBoxes) for body in now["boxes"]]
         self._boxes = {one.keyframe: one for one in boxes}
+        # States that were saved before the loop closer received objects have no such part.
+        self._objects = MapLandmarks.unpack(state.get("objects"))
         self._newest, self._merged_submaps = now["newest"], dict(map(tuple, now["joined"]))
         self._vocabulary = Vocabulary.unpack(now["vocabulary"])
         self.poses = KeyframePoses()

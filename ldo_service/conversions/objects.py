@@ -1,12 +1,13 @@
 """Conversions between messages and internal types: detections, regions, objects, distributions."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 
 from ldo_service.detection.detectors import Detections
 from ldo_service.detection.dynamic_classes import Box as MovableBox
 from ldo_service.detection.vocabulary import Vocabulary
+from ldo_service.loop_closing.object_presence import MapLandmarks
 from ldo_service.regions.foreground import RegionDetections
 from ldo_service.regions.region import Region
 from ldo_service.schemas import (
@@ -17,6 +18,7 @@ from ldo_service.schemas import (
     Keyframe,
     LabelRequest,
     MapObject,
+    MapObjects,
     ObjectObservation,
     ObjectView,
 )
@@ -158,6 +160,20 @@ def _object_to_message(
             ObjectView(keyframe=int(views[i]), box_px=_box(landmark["view_boxes"][i]))
             for i in np.flatnonzero(views >= 0)
         ),
+    )
+
+
+def landmarks_from_message(message: MapObjects, movable: Collection[str]) -> MapLandmarks:
+    """Return the objects of a message as landmarks of loop closing.
+
+    Args:
+        message: The message.
+        movable: Names of the classes that move by themselves; their objects are left out.
+    """
+    objects = [one for one in message.objects if one.name not in movable]
+    return MapLandmarks(
+        np.array([one.centroid for one in objects], float).reshape(-1, 3),
+        np.array([one.covariance for one in objects], float).reshape(-1, 3, 3),
     )
 
 

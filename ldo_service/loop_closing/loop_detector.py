@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ldo_service.errors import ConfigError, named
+from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses, RelativePose
 from ldo_service.tracking.alignment import AlignConfig
 from ldo_service.tracking.features import FeatureConfig
@@ -18,6 +19,7 @@ from ldo_service.tracking.pyramid import PyramidConfig
 
 from .consistency_check import ConsistencyCheckConfig, ConsistencyChecker
 from .object_points import DetectionPoints, cluster_landmarks, layout_histogram
+from .object_presence import MapLandmarks, ObjectPresenceChecker
 from .place_database import PlaceDatabase, RetrievalConfig, RetrievalMatch, Stages
 from .subgraph import (
     Subgraph,
@@ -91,6 +93,7 @@ class LoopDetector:
         self._verifier = Verifier(
             config.pyramid, config.align, config.features, config.verification
         )
+        self._presence = ObjectPresenceChecker()
 
     @property
     def subgraphs(self) -> Sequence[Subgraph]:
@@ -115,6 +118,7 @@ class LoopDetector:
         sightings: DetectionPoints | None,
         poses: KeyframePoses,
         merged: Mapping[int, int],
+        objects: MapLandmarks | None = None,
     ) -> list[LoopCandidateResult]:
         """Add a keyframe; return the loop candidates of the subgraph that it completes, if any.
 
@@ -126,17 +130,23 @@ class LoopDetector:
             poses: T_map_keyframe of the stored keyframes. Loops of keyframes without a pose are not
                 checked for plausible drift.
             merged: For each merged submap, the older submap that it is merged into.
+            objects: Objects of the map, which the stage two_stage uses; None if there is no map.
         """
         results: list[LoopCandidateResult] = []
         if self._open and not follows(self._open[-1].place, place, self._config.subgraphs):
-            results = self.flush(poses, merged)
+            results = self.flush(poses, merged, objects)
             self._open = []
         self._open.append(self._view(place, frame, stamp_ns, sightings))
         if is_complete(self._open, self._config.subgraphs):
-            results += self._completed(poses, merged)
+            results += self._completed(poses, merged, objects)
         return results
 
-    def flush(self, poses: KeyframePoses, merged: Mapping[int, int]) -> list[LoopCandidateResult]:
+    def flush(
+        self,
+        poses: KeyframePoses,
+        merged: Mapping[int, int],
+        objects: MapLandmarks | None = None,
+    ) -> list[LoopCandidateResult]:
         """Complete the unfinished subgraph if it is long enough, and return its loop candidates.
 
         Call this when no further keyframe follows: at the end of a run and after a loss of
@@ -145,13 +155,13 @@ class LoopDetector:
         """
         if not self.can_flush:
             return []
-        return self._completed(poses, merged)
+        return self._completed(poses, merged, objects)
 
     def _completed(
-        self, poses: KeyframePoses, merged: Mapping[int, int]
+        self, poses: KeyframePoses, merged: Mapping[int, int], objects: MapLandmarks | None
     ) -> list[LoopCandidateResult]:
         new, self._open = self._subgraph(self._open), []
-        results = self._findings(new, poses, merged)
+        results = self._findings(new, poses, merged, objects)
         kept = evenly_spaced(new.views, self._config.subgraphs.kept_views)
         self._memory.add(replace(new, views=kept))
         return results
@@ -200,28 +210,46 @@ class LoopDetector:
 
     # --- loops ------------------------------------------------------------------------------------
     def _findings(
-        self, new: Subgraph, poses: KeyframePoses, merged: Mapping[int, int]
+        self,
+        new: Subgraph,
+        poses: KeyframePoses,
+        merged: Mapping[int, int],
+        objects: MapLandmarks | None,
     ) -> list[LoopCandidateResult]:
         """Return all loop candidates of a new subgraph, with the results of their verification.
 
-        The candidates with the most inliers are verified first. The first candidate that passes
-        becomes the loop closure, and all others are rejected.
+        All candidates are verified. Those that fail make no other candidate ambiguous. Of those
+        that pass, the one with the most inliers becomes the loop closure; the others are rejected.
         """
         known = ConsistencyChecker(poses, merged, self._config.plausibility)
         is_possible = known.possible_matches(
             [old.views[0] for old in self.subgraphs], new.views[-1]
         )
         likely = self._memory.query(new, is_possible)
-        proposals = [
-            known.check_drift(self._proposal(like.subgraph, new, known)) for like in likely
+        checks: list[VerificationResult] = []
+        for like in likely:
+            proposal = known.check_drift(self._proposal(like.subgraph, new, known))
+            check = self._check(proposal)
+            if check.closure and objects and self._config.stages == "two_stage":
+                check = self._check_objects(
+                    check, check.closure, like.subgraph, new, poses, objects
+                )
+            checks.append(check)
+        proposals = known.reject_aliased([_with_reason(check) for check in checks])
+        checks = [
+            _rejected(check, proposal.rejected_reason)
+            for check, proposal in zip(checks, proposals, strict=True)
         ]
-        proposals = known.reject_aliased(proposals)
-        checks: dict[int, VerificationResult] = {}
-        is_closed = False
-        for index in sorted(range(len(likely)), key=lambda i: -proposals[i].inliers):
-            checks[index] = self._check(proposals[index], is_closed)
-            is_closed = is_closed or checks[index].closure is not None
-        return [LoopCandidateResult(new, like, checks[index]) for index, like in enumerate(likely)]
+        passed = [k for k, check in enumerate(checks) if check.closure]
+        best = max(passed, key=lambda k: checks[k].proposal.inliers, default=None)
+        return [
+            LoopCandidateResult(
+                new,
+                like,
+                check if k == best else _rejected(check, "another candidate closed the loop"),
+            )
+            for k, (like, check) in enumerate(zip(likely, checks, strict=True))
+        ]
 
     def _proposal(self, old: Subgraph, new: Subgraph, known: ConsistencyChecker) -> LoopHypothesis:
         """Return the loop hypothesis of a candidate; it is marked as rejected if no pose is found.
@@ -242,14 +270,29 @@ class LoopDetector:
             )
         return proposal
 
-    def _check(self, proposal: LoopHypothesis, is_closed: bool) -> VerificationResult:
+    def _check(self, proposal: LoopHypothesis) -> VerificationResult:
         if proposal.rejected_reason:
             return VerificationResult(proposal, rejected_reason=proposal.rejected_reason)
-        if is_closed:
-            return VerificationResult(proposal, rejected_reason="another candidate closed the loop")
         if self._config.stages == "semantic":
             return self._verifier.accept_unverified(proposal)
         return self._verifier.verify(proposal)
+
+    def _check_objects(
+        self,
+        check: VerificationResult,
+        closure: RelativePose,
+        old: Subgraph,
+        new: Subgraph,
+        poses: KeyframePoses,
+        objects: MapLandmarks,
+    ) -> VerificationResult:
+        """Return a verified hypothesis, rejected if objects of the map are missing."""
+        if closure.a not in poses or closure.b not in poses:
+            return check
+        T_there_new = poses[closure.a] @ closure.T_a_b @ se3.inverse(poses[closure.b])
+        found = self._presence.check(objects, old, new, T_there_new, poses)
+        reason = f"{found.missing} of {found.tested} objects are missing"
+        return _rejected(check, reason if found.contradicts else "")
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
@@ -274,6 +317,18 @@ class LoopDetector:
         self._words = VisualWords(self._config.words, state["words"])
         self._path_m, last = state["path"]
         self._last = None if last is None else (last[0], last[1])
+
+
+def _rejected(check: VerificationResult, reason: str) -> VerificationResult:
+    """Return the result rejected for a reason, unless it is rejected already or there is none."""
+    if check.rejected_reason or not reason:
+        return check
+    return replace(check, rejected_reason=reason, closure=None)
+
+
+def _with_reason(check: VerificationResult) -> LoopHypothesis:
+    """Return the hypothesis of a result, rejected for the reason of the result."""
+    return replace(check.proposal, rejected_reason=check.rejected_reason)
 
 
 def _unless_refused(proposal: LoopHypothesis, other: LoopHypothesis) -> LoopHypothesis:

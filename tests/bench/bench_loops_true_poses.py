@@ -1,21 +1,30 @@
 """Accuracy of loop closing on true poses, without errors of tracking.
 
     OMP_NUM_THREADS=1 python -m tests.bench.bench_loops_true_poses [SOURCE ...] [--every N]
-        [--model FILE.onnx] [--stages two_stage geometric semantic]
+        [--model FILE.onnx] [--labeller NAME] [--stages two_stage geometric semantic]
 
 SOURCE: sequences with true poses; default: `synthetic:twins`. Every N-th frame is a keyframe at its
-true pose. Objects come from the detector --model; default: demo. The columns are those of
+true pose. Detections come from the detector --model; default: demo. A mapper builds the map at the
+true poses, and the loop detector gets its objects after each keyframe. The labeller --labeller
+names regions for the mapper; default: demo; `-` stands for none. The columns are those of
 bench_loops.py.
 """
 
 import argparse
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
+from ldo_service.actors.detector import Detector, DetectorConfig
+from ldo_service.actors.mapper import Mapper
+from ldo_service.actors.vlm_labeller import VlmLabeller
+from ldo_service.config import actor_parameters, load_config
+from ldo_service.conversions.frames import camera_to_message
+from ldo_service.conversions.objects import landmarks_from_message
+from ldo_service.conversions.poses import matrix6_to_message, pose_to_message
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.detection.detectors import NetworkConfig
 from ldo_service.detection.model_registry import open_detector
@@ -33,7 +42,17 @@ from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.loop_closing import LoopDetector, LoopsConfig
 from ldo_service.loop_closing.loop_detector import LoopCandidateResult
 from ldo_service.loop_closing.object_points import DetectionPoints, locate_detections
+from ldo_service.loop_closing.object_presence import MapLandmarks
 from ldo_service.loop_closing.place_database import Stages
+from ldo_service.schemas import (
+    Array,
+    DetectionBoxes,
+    Keyframe,
+    LabelRequest,
+    LabelResult,
+    MapObjects,
+    Message,
+)
 from ldo_service.tracking.keyframe_database import KeyframeRecord, make_keyframe_record
 from ldo_service.tracking.keyframes import ReferenceKeyframe
 from ldo_service.tracking.pyramid import pyramid_of
@@ -79,7 +98,51 @@ def keyframes(
     return taken
 
 
-def found_loops(taken: list[Taken], stages: Stages) -> FoundLoops:
+def map_objects(
+    sequence: Sequence, taken: list[Taken], model: str, labeller: str
+) -> list[MapLandmarks]:
+    """Return the objects of the map after each keyframe; a mapper gets the true poses.
+
+    Args:
+        sequence: The sequence.
+        taken: Its keyframes.
+        model: The detector.
+        labeller: The labeller; "" for none.
+    """
+    parameters = actor_parameters(load_config())
+    mapper = Mapper(parameters.mapper, has_labeller=bool(labeller))
+    namer = VlmLabeller(replace(parameters.vlm_labeller, model=labeller))
+    detector = Detector(DetectorConfig(model=model))
+    movable = parameters.loop_closer.movable.classes
+    objects, after = MapLandmarks.none(), []
+    for k, one in enumerate(taken):
+        frame = sequence[one.frame]
+        keyframe = Keyframe(
+            stamp_ns=one.stamp_ns,
+            keyframe=k,
+            frame=one.frame,
+            camera=camera_to_message(frame.camera),
+            color=Array.of(frame.color),
+            depth_m=Array.of(frame.depth_m),
+            reference=None,
+            T_reference_keyframe=pose_to_message(np.eye(4)),
+            information=matrix6_to_message(1e4 * np.eye(6)),
+            T_odom_keyframe=pose_to_message(one.T_odom_keyframe),
+        )
+        waiting: list[Message] = [keyframe, *detector.handle(keyframe)]
+        while waiting:
+            message = waiting.pop(0)
+            if isinstance(message, LabelRequest):
+                waiting += namer.handle(message)
+            elif isinstance(message, MapObjects):
+                objects = landmarks_from_message(message, movable)
+            elif isinstance(message, Keyframe | DetectionBoxes | LabelResult):
+                waiting += mapper.handle(message)
+        after.append(objects)
+    return after
+
+
+def found_loops(taken: list[Taken], objects: list[MapLandmarks], stages: Stages) -> FoundLoops:
     """Return the loops that the loop detector finds with one of its modes."""
     detector, poses = LoopDetector(LoopsConfig(stages=stages)), KeyframePoses()
     candidates: list[ComparedPair] = []
@@ -99,9 +162,10 @@ def found_loops(taken: list[Taken], stages: Stages) -> FoundLoops:
         before = taken[k - 1].T_odom_keyframe if k else new.T_odom_keyframe
         step = se3.inverse(before) @ new.T_odom_keyframe
         poses.add(k, k - 1 if k else None, step, new.T_odom_keyframe, 0)
-        sightings = None if stages == "geometric" else new.sightings
-        take(lambda n=new, s=sightings: detector.add(n.place, n.frame, n.stamp_ns, s, poses, {}))
-    take(lambda: detector.flush(poses, {}))
+        seen = None if stages == "geometric" else new.sightings
+        inputs = new.place, new.frame, new.stamp_ns, seen, poses, {}, objects[k]
+        take(lambda inputs=inputs: detector.add(*inputs))
+    take(lambda: detector.flush(poses, {}, objects[-1]))
     return FoundLoops(tuple(candidates), tuple(closures))
 
 
@@ -110,6 +174,7 @@ def main() -> None:
     parser.add_argument("sources", nargs="*", metavar="SOURCE", default=["synthetic:twins"])
     parser.add_argument("--every", type=int, default=4, metavar="N")
     parser.add_argument("--model", default="demo", metavar="FILE.onnx")
+    parser.add_argument("--labeller", default="demo", metavar="NAME")
     parser.add_argument("--stages", nargs="*", default=STAGES, choices=STAGES)
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
@@ -120,10 +185,12 @@ def main() -> None:
         truth = sequence.truth()
         assert truth is not None, f"{sequence.name} has no ground truth"
         taken = keyframes(sequence, truth.T_world_camera, arguments.every, arguments.model)
+        labeller = arguments.labeller.strip("-")
+        objects = map_objects(sequence, taken, arguments.model, labeller)
         frames = {k: one.frame for k, one in enumerate(taken)}
         seen = seen_keyframes(frames, sequence, truth)
         for stages in arguments.stages:
-            errors: LoopErrors = evaluate_loops(found_loops(taken, stages), seen)
+            errors: LoopErrors = evaluate_loops(found_loops(taken, objects, stages), seen)
             print(f"| {sequence.name} | {stages} | {row(errors)}", flush=True)
 
 
