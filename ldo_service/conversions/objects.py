@@ -171,9 +171,14 @@ def landmarks_from_message(message: MapObjects, movable: Collection[str]) -> Map
         movable: Names of the classes that move by themselves; their objects are left out.
     """
     objects = [one for one in message.objects if one.name not in movable]
+    names = sorted({name for one in objects for name, _ in one.distribution} | {"other"})
+    index = {name: k for k, name in enumerate(names)}
     return MapLandmarks(
         np.array([one.centroid for one in objects], float).reshape(-1, 3),
         np.array([one.covariance for one in objects], float).reshape(-1, 3, 3),
+        np.array(
+            [dense_distribution(one.distribution, index.__getitem__, len(names)) for one in objects]
+        ).reshape(-1, len(names)),
     )
 
 

@@ -286,12 +286,15 @@ class LoopDetector:
         poses: KeyframePoses,
         objects: MapLandmarks,
     ) -> VerificationResult:
-        """Return a verified hypothesis, rejected if objects of the map are missing."""
+        """Return a verified hypothesis, rejected if objects of the map contradict it."""
         if closure.a not in poses or closure.b not in poses:
             return check
         T_there_new = poses[closure.a] @ closure.T_a_b @ se3.inverse(poses[closure.b])
         found = self._presence.check(objects, old, new, T_there_new, poses)
-        reason = f"{found.missing} of {found.tested} objects are missing"
+        reason = (
+            f"{found.missing} objects are missing and {found.replaced} replaced, "
+            f"in {found.tested} tests"
+        )
         return _rejected(check, reason if found.contradicts else "")
 
     # --- state ------------------------------------------------------------------------------------

@@ -1,6 +1,6 @@
 """Objects that depth images show to be present, missing or hidden at a relative pose."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,6 +13,7 @@ from ldo_service.loop_closing.object_presence import (
     MapLandmarks,
     ObjectPresence,
     ObjectPresenceChecker,
+    count_replaced,
     ray_fractions,
 )
 
@@ -32,11 +33,12 @@ def depth_of(*centers_m: tuple[float, float, float]) -> np.ndarray:
     return depth_m.astype(np.float32)
 
 
-def landmarks(*centers_m: tuple[float, float, float]) -> MapLandmarks:
+def landmarks(*centers_m: tuple[float, float, float], label: int = 0) -> MapLandmarks:
     """Return balls with the covariance of a uniform distribution on their surface."""
     return MapLandmarks(
         np.array(centers_m, float).reshape(-1, 3),
         np.tile(RADIUS_M**2 / 3 * np.eye(3), (len(centers_m), 1, 1)),
+        np.tile(np.eye(3)[label], (len(centers_m), 1)),
     )
 
 
@@ -101,7 +103,9 @@ def test_hidden_unmeasured_and_outside_objects_give_no_information() -> None:
 
 
 def test_flat_object_on_the_wall_is_hit() -> None:
-    picture = MapLandmarks(np.array([[0.0, 0, WALL_M]]), np.diag([0.04, 0.04, 0])[None])
+    picture = MapLandmarks(
+        np.array([[0.0, 0, WALL_M]]), np.diag([0.04, 0.04, 0])[None], np.ones((1, 1))
+    )
     hit, through = ray_fractions(picture, depth_of(), CAMERA)
     assert (hit[0], through[0]) == (1, 0)
 
@@ -152,10 +156,49 @@ def test_views_without_a_pose_are_ignored() -> None:
     assert (found.tested, found.missing) == (1, 1)
 
 
-def test_one_of_25_objects_may_be_missing() -> None:
-    assert not ObjectPresence(25, 1).contradicts
-    assert ObjectPresence(24, 1).contradicts
-    assert not ObjectPresence(0, 0).contradicts
+def joined(a: MapLandmarks, b: MapLandmarks) -> MapLandmarks:
+    return MapLandmarks(
+        np.concatenate([a.p_map, b.p_map]),
+        np.concatenate([a.covariance, b.covariance]),
+        np.concatenate([a.distributions, b.distributions]),
+    )
+
+
+@pytest.mark.parametrize(("label", "replaced"), [(0, 0), (1, 1)])
+def test_object_with_another_label_at_the_same_place_replaces_it(label, replaced) -> None:
+    """Two places 5 m apart show equal balls, to which the map gives equal or different labels."""
+    old, new = subgraph(0, depth_of(AHEAD)), subgraph(1, depth_of(AHEAD))
+    objects = joined(landmarks(AHEAD), landmarks((5.0, 0.0, BALL_M), label=label))
+    poses = poses_of(np.eye(4), shift(5.0))
+    found = ObjectPresenceChecker().check(objects, old, new, shift(-5.0), poses)
+    assert (found.tested, found.missing, found.replaced) == (2, 0, replaced)
+
+
+def test_uncertain_labels_replace_nothing() -> None:
+    a, b = landmarks(AHEAD), landmarks(AHEAD, label=1)
+    unsure = replace(b, distributions=np.array([[0.1, 0.9, 0.0]]))
+    assert count_replaced(a, b) == 1
+    assert count_replaced(a, unsure) == 0, "KL(a || unsure) = log 10 = 2.3 nats"
+
+
+def test_objects_side_by_side_are_not_compared() -> None:
+    beside = landmarks((2.5 * RADIUS_M, 0.0, BALL_M), label=1)
+    assert count_replaced(landmarks(AHEAD), beside) == 0
+    assert count_replaced(landmarks(), beside) == 0
+
+
+def test_nested_object_is_compared_with_the_object_of_its_size() -> None:
+    """A book in a shelf, seen twice, is not compared with the shelf."""
+    shelf = replace(landmarks(AHEAD, label=1), covariance=0.1 * np.eye(3)[None])
+    both = joined(landmarks(AHEAD), shelf)
+    assert count_replaced(both, both) == 0
+
+
+def test_one_of_25_objects_may_be_missing_or_replaced() -> None:
+    assert not ObjectPresence(25, 1, 0).contradicts
+    assert ObjectPresence(24, 1, 0).contradicts
+    assert ObjectPresence(24, 0, 1).contradicts
+    assert not ObjectPresence(0, 0, 0).contradicts
 
 
 def test_landmarks_of_a_snapshot_are_equal() -> None:
@@ -164,4 +207,5 @@ def test_landmarks_of_a_snapshot_are_equal() -> None:
     again = MapLandmarks.unpack(objects.pack())
     assert np.array_equal(again.p_map, objects.p_map)
     assert np.array_equal(again.covariance, objects.covariance)
+    assert np.array_equal(again.distributions, objects.distributions)
     assert len(MapLandmarks.unpack(None)) == 0
