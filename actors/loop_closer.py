@@ -97,7 +97,7 @@ class LoopCloser(Actor):
         In(KEYFRAME_NEW, Backlog(4)),
         In(DETECTION_BOXES, Backlog(16)),
         In(GRAPH_CORRECTION, Latest(1)),
-        In(MAP_OBJECTS, Latest(1)),
+        In(MAP_OBJECTS, Latest(1), needs_final=False),  # The mapper finishes after the last loop.
     )
     outputs = (Out(LOOP_CLOSURE, is_final=True), Out(LOOP_CANDIDATE, is_final=True))
     is_backend = True

@@ -94,13 +94,17 @@ def _final_topics(actor: HasPorts) -> set[str]:
 
 
 def _reached(topics: set[str], actors: Sequence[HasPorts]) -> set[str]:
-    """Return the names of the actors that topics reach, directly or through other actors."""
+    """Return the names of the actors that topics reach, directly or through other actors.
+
+    Inputs without `needs_final` are ignored.
+    """
     reached: set[str] = set()
     while True:
         new = {
             actor.name
             for actor in actors
-            if actor.name not in reached and topics & {port.topic.name for port in actor.inputs}
+            if actor.name not in reached
+            and topics & {port.topic.name for port in actor.inputs if port.needs_final}
         }
         if not new:
             return reached

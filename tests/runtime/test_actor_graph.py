@@ -83,6 +83,16 @@ def test_final_messages_reach_other_actors_before_these_finish() -> None:
     assert sorted(names) == sorted(actor.name for actor in GRAPH)
 
 
+def test_input_that_needs_no_final_messages_leaves_the_order() -> None:
+    """With the final messages, the two form a cycle, and the first one finishes first."""
+    sink = final("sink", [(A, Lossless())], [B])
+    source = final("source", [], [A])
+    source.inputs = (In(B, Latest(), needs_final=False),)
+    assert finish_order([sink, source]) == [source, sink]
+    source.inputs = (In(B, Latest()),)
+    assert finish_order([sink, source]) == [sink, source]
+
+
 def test_actors_finish_in_a_cycle_of_final_messages_too() -> None:
     one = final("one", [(B, Latest())], [A])
     two = final("two", [(A, Lossless())], [B])
