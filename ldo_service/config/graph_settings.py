@@ -19,8 +19,9 @@ from .values import (
 class RetrievalSettings:
     """Search for subgraphs of keyframes that look like the newest subgraph."""
 
-    # Comparison of subgraphs: by labels and images (two_stage), by labels alone (semantic), or by
-    # images alone (geometric). The modes semantic and geometric serve for evaluation.
+    # Comparison of subgraphs: by labels, images and the objects of the map (two_stage), by labels
+    # alone (semantic), or by images alone (geometric). The modes semantic and geometric serve for
+    # evaluation.
     mode: Literal["two_stage", "semantic", "geometric"] = "two_stage"
     # Minimum number of camera frames between the two subgraphs of a loop closure (LDO-SLAM paper,
     # III.C).

@@ -42,9 +42,9 @@ class LoopsConfig:
     """Parameters of loop detection."""
 
     # Data that the coarse and the fine step use. two_stage: labels and images find candidates, and
-    # surfaces verify poses from features, landmarks or the map. The other values are for
-    # comparison. geometric: no labels; semantic: no images, only landmarks as in the
-    # LDO-SLAM paper, III.C.
+    # surfaces verify poses from features, landmarks or the map. If there is a map, its objects
+    # verify them too. The other values are for comparison. geometric: no labels; semantic: no
+    # images, only landmarks as in the LDO-SLAM paper, III.C.
     stages: Stages = "two_stage"
     subgraphs: SubgraphConfig = field(default_factory=SubgraphConfig)
     words: VisualWordsConfig = field(default_factory=VisualWordsConfig)
