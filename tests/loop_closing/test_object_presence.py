@@ -209,3 +209,26 @@ def test_landmarks_of_a_snapshot_are_equal() -> None:
     assert np.array_equal(again.covariance, objects.covariance)
     assert np.array_equal(again.distributions, objects.distributions)
     assert len(MapLandmarks.unpack(None)) == 0
+
+
+def test_replaced_objects_among_many_are_counted_without_comparing_each_pair(monkeypatch) -> None:
+    """A hall of 40 x 40 balls, 1 m apart, of which three have another label at the second visit."""
+    x, z = np.meshgrid(np.arange(40.0), np.arange(40.0))
+    centers_m = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
+    hall = landmarks(*map(tuple, centers_m.tolist()))
+    changed = hall.distributions.copy()
+    changed[[0, 700, 1599]] = np.eye(3)[1]
+    again = replace(hall, p_map=centers_m + np.array([0.02, 0, 0]), distributions=changed)
+    inverted: list[int] = []
+    inverse = np.linalg.inv
+    monkeypatch.setattr(np.linalg, "inv", lambda M: inverted.append(len(M)) or inverse(M))
+    assert count_replaced(hall, again) == 3
+    assert sum(inverted) == len(hall), "only the pairs at one place are compared"
+
+
+@pytest.mark.parametrize("apart", [0.0, 1.0, 2.0, 2.3, 2.4, 3.0])
+def test_objects_are_at_one_place_up_to_a_bhattacharyya_coefficient_of_a_half(apart) -> None:
+    """Equal Gaussians with sigma s, d apart, have BC = exp(-d^2 / (8 s^2)): 0.5 at d = 2.35 s."""
+    sigma_m = np.sqrt(RADIUS_M**2 / 3 + 0.01**2)  # The tolerance of flat objects is 1 cm.
+    beside = landmarks((apart * sigma_m, 0.0, BALL_M), label=1)
+    assert count_replaced(landmarks(AHEAD), beside) == (apart < 2.35)
