@@ -1,0 +1,83 @@
+"""Tests of the choice among the verified candidates of a subgraph."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ldo_service.geometry import se3
+from ldo_service.geometry.keyframe_poses import KeyframePoses, RelativePose
+from ldo_service.loop_closing import LoopCandidateResult, LoopDetector, LoopsConfig
+from ldo_service.loop_closing.place_database import RetrievalMatch
+from ldo_service.loop_closing.verification import LoopHypothesis, VerificationResult
+
+NEW = 2  # Id of the keyframe of the new subgraph; the old subgraphs have the keyframes 0 and 1.
+DEPTH_ERROR = "the surfaces differ"
+
+
+def subgraph(keyframe: int) -> Any:
+    place = SimpleNamespace(submap=0, median_depth_m=2.0, T_odom_keyframe=np.eye(4))
+    return SimpleNamespace(
+        views=(SimpleNamespace(keyframe=keyframe, place=place, path_m=50.0 * (keyframe == NEW)),)
+    )
+
+
+def results(
+    monkeypatch: pytest.MonkeyPatch, inliers: tuple[int, int], reasons: tuple[str, str]
+) -> list[LoopCandidateResult]:
+    """Return the results of two candidates, 4 m apart.
+
+    Args:
+        monkeypatch: Fixture, which replaces retrieval and verification.
+        inliers: Inliers of both candidates.
+        reasons: Reasons for which the verification rejects them; "" if it accepts them.
+    """
+    detector, new = LoopDetector(LoopsConfig()), subgraph(NEW)
+    matches = [RetrievalMatch(subgraph(k), 1.0, 1.0, 1.0, 1.0) for k in (0, 1)]
+    poses = KeyframePoses()
+    for k, x_m in enumerate((0.0, 4.0, 2.0)):
+        poses.add(k, None, np.eye(4), se3.exp(np.array([0, 0, 0, x_m, 0, 0])))
+
+    def proposed(old: Any, new: Any, _known: Any) -> LoopHypothesis:
+        view = old.views[0]
+        count = inliers[view.keyframe]
+        return LoopHypothesis(view, new.views[0], np.eye(4), "features", count)
+
+    def checked(proposal: LoopHypothesis) -> VerificationResult:
+        old = proposal.old.keyframe
+        closure = RelativePose(old, NEW, np.eye(4), np.eye(6))
+        return VerificationResult(
+            proposal,
+            rejected_reason=reasons[old],
+            closure=None if reasons[old] else closure,
+        )
+
+    monkeypatch.setattr(detector._memory, "query", lambda _new, _may: matches)
+    monkeypatch.setattr(detector, "_proposal", proposed)
+    monkeypatch.setattr(detector, "_check", checked)
+    return detector._findings(new, poses, {}, None)
+
+
+def reasons_of(found: list[LoopCandidateResult]) -> list[str]:
+    return [one.check.rejected_reason for one in found]
+
+
+def test_two_candidates_that_pass_at_different_places_are_ambiguous(monkeypatch) -> None:
+    found = results(monkeypatch, (60, 50), ("", ""))
+    assert reasons_of(found) == ["ambiguous: another place fits as well"] * 2
+    assert not any(one.closure for one in found)
+
+
+def test_candidate_that_fails_the_verification_makes_no_other_ambiguous(monkeypatch) -> None:
+    found = results(monkeypatch, (60, 50), (DEPTH_ERROR, ""))
+    assert reasons_of(found) == [DEPTH_ERROR, ""]
+    assert found[0].closure is None
+    assert found[1].closure is not None
+
+
+def test_clearly_better_candidate_closes_the_loop(monkeypatch) -> None:
+    """The other candidate has less than half of its inliers, so that only one is ambiguous."""
+    found = results(monkeypatch, (20, 60), ("", ""))
+    assert reasons_of(found) == ["ambiguous: another place fits as well", ""]
+    assert found[1].closure is not None
