@@ -102,7 +102,8 @@ class LoopCloser(Actor):
     outputs = (Out(LOOP_CLOSURE, is_final=True), Out(LOOP_CANDIDATE, is_final=True))
     is_backend = True
     # Time without messages after which the unfinished subgraph is compared, seconds. A camera that
-    # makes no keyframe for this time stands still.
+    # makes no keyframe for this time stands still. Objects of the map are messages too: while the
+    # mapper works idly and publishes them more often than this, the comparison waits.
     idle_after_s = 5.0
 
     def __init__(self, config: LoopCloserConfig | None = None) -> None:
