@@ -9,6 +9,7 @@
     ├── DataError                 3
     │   ├── FrameError
     │   └── DamagedStateError
+    ├── DeviceError
     ├── StageError                4
     │   ├── RestartsExhausted
     │   └── StageStalled
@@ -61,6 +62,13 @@ class UnavailableError(ConfigError):
 
 class ModelError(ConfigError):
     """Neural network file that has the wrong format, or whose inference fails."""
+
+
+class DeviceError(LdoError):
+    """Device that cannot compute: it is missing, failed, is out of memory, or gives wrong results.
+
+    Callers continue on the CPU.
+    """
 
 
 class DataError(LdoError):

@@ -11,9 +11,11 @@ import numpy as np
 
 from ldo_service.errors import ConfigError, named
 
+from .device_choice import DeviceChoice
 from .keyframe_store import KeyframeViews
 from .model import GaussianMap
-from .optimizer import GaussianOptimizer, GaussianOptimizerConfig, Observer
+from .optimizer import GaussianOptimizer, GaussianOptimizerConfig
+from .plan_attempt import Observer
 from .training_views import TrainingView, covisibility_ratio, sample_training_views, sampled_surface
 
 # Number of random draws per needed keyframe. The additional draws replace drawn keyframes that may
@@ -83,6 +85,11 @@ class Fitting:
         self._seed = seed
         self.iterations = 0
         self.unusable = 0  # Number of keyframes that were chosen but skipped.
+
+    @property
+    def device(self) -> DeviceChoice:
+        """Device of the iterations."""
+        return self._optimizer.device
 
     @property
     def threads(self) -> int:

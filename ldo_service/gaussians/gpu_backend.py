@@ -1,13 +1,15 @@
-"""GPU backend of the Gaussian optimizer; experimental, and no setting selects it yet."""
+"""GPU backend of the Gaussian optimizer; it is experimental."""
 
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from math import log10
 from weakref import ref
 
 import numpy as np
 
+from ldo_service.errors import DeviceError
 from ldo_service.geometry import se3
 from ldo_service.kernels.gpu import descent, frame_loss, plane_rendering
 from ldo_service.kernels.gpu.arrays import Arrays
@@ -17,7 +19,7 @@ from .exposure import Exposure, ImageBlocks, block_side, fit_blocks
 from .gpu_mirror import GaussianMirror
 from .loss import ImageLoss, LossWeights
 from .model import GaussianMap
-from .optimizer_backend import ShapeLimits
+from .optimizer_backend import CpuBackend, ShapeLimits
 from .renderer import VisibleGaussians
 from .training_views import TrainingView
 
@@ -54,6 +56,28 @@ class ResidentFrame:
         )
 
 
+@contextmanager
+def device_errors(what: str) -> Iterator[None]:
+    """Convert errors of the device in a `with` block to DeviceError.
+
+    torch, Triton and the driver raise errors of several classes, without a common base class.
+
+    Args:
+        what: What the block does, for the error text.
+
+    Raises:
+        DeviceError: The block raised an error.
+    """
+    try:
+        yield
+    except Exception as error:
+        line = (str(error).strip().splitlines() or [""])[0].rstrip(".")
+        raise DeviceError(
+            f"the {what} failed with {type(error).__name__}: {line}. If memory is short, reduce "
+            "mapper.offload.max_resident_gaussians."
+        ) from error
+
+
 class GpuBackend:
     """Iterations of the Gaussian optimizer by the kernels of `kernels.gpu`.
 
@@ -71,6 +95,8 @@ class GpuBackend:
         limits: Limits on the shape of the Gaussians.
     """
 
+    can_fail: bool = True
+
     def __init__(
         self, arrays: Arrays, adam: AdamConfig, weights: LossWeights, limits: ShapeLimits
     ) -> None:
@@ -85,30 +111,44 @@ class GpuBackend:
 
     def begin(self, gaussians: GaussianMap) -> None:
         self._gaussians = gaussians
-        self.mirror.update(gaussians, self._adam)
+        with device_errors("upload of the map"):
+            self.mirror.update(gaussians, self._adam)
 
     def end(self) -> None:
         gaussians, self._gaussians, self._rendered = self._gaussians, None, None
         if gaussians is not None:
-            self.mirror.write_back(gaussians, self._adam)
+            with device_errors("download of the map"):
+                self.mirror.write_back(gaussians, self._adam)
+
+    def on_cpu(self) -> CpuBackend:
+        backend = CpuBackend(self._config, self._weights, self._limits, threads=self.threads)
+        backend.restore(self.snapshot())
+        return backend
 
     def render(self, view: TrainingView, *, is_half: bool) -> None:
         assert self._gaussians is not None, "begin comes first"
-        frame = self._frame(view, is_half)
         binning = 2 if is_half else 1
         T_camera_map = se3.inverse(view.T_map_camera)
-        values = plane_rendering.view_of(T_camera_map, frame.intrinsics, binning)
-        rendering = plane_rendering.render(
-            self._arrays, self.mirror.rows, len(self._gaussians), values, *frame.size
-        )
+        with device_errors("rendering"):
+            frame = self._frame(view, is_half)
+            values = plane_rendering.view_of(T_camera_map, frame.intrinsics, binning)
+            rendering = plane_rendering.render(
+                self._arrays, self.mirror.rows, len(self._gaussians), values, *frame.size
+            )
         self._rendered = frame, rendering, binning
 
     def estimate_exposure(self) -> Exposure | None:
         frame, rendering, _ = self._last()
-        means = plane_rendering.mean_blocks(self._arrays, rendering, block_side(rendering.width))
+        side = block_side(rendering.width)
+        with device_errors("estimate of the exposure"):
+            means = plane_rendering.mean_blocks(self._arrays, rendering, side)
         return fit_blocks(means[:3], means[3], frame.blocks)
 
     def descend(self, exposure: Exposure, *, rate: float) -> tuple[ImageLoss, VisibleGaussians]:
+        with device_errors("step"):
+            return self._descend(exposure, rate)
+
+    def _descend(self, exposure: Exposure, rate: float) -> tuple[ImageLoss, VisibleGaussians]:
         frame, rendering, binning = self._last()
         weights = self._weights
         by_planes, (l1, d_ssim, depth, squared) = frame_loss.image_loss(

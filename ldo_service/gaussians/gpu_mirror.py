@@ -79,6 +79,7 @@ class GaussianMirror:
             self._arrays.download(self._arrays.take(array, places))
             for array in (self.rows, self.moments, self.squares)
         )
+        # The map changes only after the last download, so that a failed device leaves it as it was.
         gaussians.rows[touched] = self._known[touched] = rows
         state.mean[touched], state.square[touched] = moments, squares
         state.steps[touched] = steps[touched]

@@ -21,7 +21,7 @@ from .map_builder_config import MapBuilderConfig
 from .map_files import MapFiles
 from .model import GaussianBatch, GaussianMap
 from .offloading import OffloadedGaussians, iter_all_gaussians
-from .optimizer import Observer
+from .plan_attempt import Observer
 from .pruning import find_duplicates, prunable_mask
 from .renderer import Contributions, Rendering
 from .training_views import TrainingView, visible_in_mask
@@ -391,6 +391,7 @@ class MapBuilder:
             "iterations": self.fitting.iterations,
             # Chosen keyframes that may see offloaded Gaussians, or whose images are unreadable.
             "keyframes_skipped": self.fitting.unusable,
+            **self.fitting.device.metrics(),
             # Gaussians in memory beyond the limit, because recent keyframes may see them.
             "gaussians_over_limit": self._excess,
             **self.offloaded.metrics(),

@@ -1,83 +1,42 @@
 """Optimization of the map against keyframes: Gaussians, exposures and, optionally, poses."""
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import inf
-from typing import Protocol
 
 import numpy as np
 
-from ldo_service.errors import ConfigError, named
+from ldo_service.errors import ConfigError, DeviceError, named
 from ldo_service.geometry import se3
 
 from .adam import AdamConfig
+from .device_choice import Device, choose_backend, given
 from .exposure import Exposure
 from .loss import ImageLoss, LossWeights
 from .model import GaussianMap
-from .optimizer_backend import CpuBackend, OptimizerBackend, ShapeLimits
+from .optimizer_backend import OptimizerBackend, ShapeLimits
+from .plan_attempt import Observer, PlanAttempt, Views
+from .pose_adam import PoseAdam
 from .renderer import VisibleGaussians
 from .training_views import TrainingView
 
-# Constants of Adam for keyframe poses. A pose gets few steps, so its moments average over more
-# steps than those of the Gaussians.
-BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
 # Effort of an iteration at half resolution, relative to one at full resolution: the ratio of their
 # times, which is 0.3 to 0.44, depending on the number of visible Gaussians.
 HALF_EFFORT = 0.38
 # Images with a shorter side are not halved, because too little of their detail would be left: in a
 # test with 128x96 pixels, the mean error of objects rises above 10 cm.
 MIN_HALVED_PX = 200
-WIDTH = 6  # Size of the tangent vector of a pose: rotation, then translation.
 
-
-Observer = Callable[[int, VisibleGaussians], None]
-
-
-class PoseAdam:
-    """Adam optimizer of the keyframe poses, with moments for each keyframe."""
-
-    def __init__(self) -> None:
-        # First moments, second moments and number of steps of each keyframe, [3, WIDTH].
-        self._moments: dict[int, np.ndarray] = {}
-
-    def direction(self, keyframe: int, gradient: np.ndarray) -> np.ndarray:
-        """Update the moments of a keyframe, and return the direction of the next step.
-
-        Args:
-            keyframe: Id of the keyframe.
-            gradient: dL/dxi of the pose T exp(xi), [6]: rotation rad, translation m.
-
-        Returns:
-            Direction, [6]. The step is this direction times the negative learning rates.
-        """
-        mean, square, steps = self._moments.setdefault(keyframe, np.zeros((3, WIDTH)))
-        steps += 1
-        mean += (1 - BETA1) * (gradient - mean)
-        square += (1 - BETA2) * (gradient * gradient - square)
-        return mean / (1 - BETA1**steps) / (np.sqrt(square / (1 - BETA2**steps)) + EPSILON)
-
-    def forget(self, keyframe: int) -> None:
-        """Drop the moments of a keyframe."""
-        self._moments.pop(keyframe, None)
-
-    def snapshot(self) -> dict[str, np.ndarray]:
-        keyframes = sorted(self._moments)
-        moments = [self._moments[k] for k in keyframes]
-        return {
-            "keyframes": np.array(keyframes, np.int64),
-            "keyframe_moments": np.array(moments, float).reshape(-1, 3, WIDTH),
-        }
-
-    def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        keyframes = state["keyframes"].tolist()
-        moments = state["keyframe_moments"]
-        self._moments = dict(zip(keyframes, moments.copy(), strict=True))
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class GaussianOptimizerConfig:
     """Settings of the Gaussian optimizer."""
 
+    # Device of the iterations; auto: a GPU if it passes a self-test, otherwise the CPU.
+    device: Device = "cpu"
     adam: AdamConfig = field(default_factory=AdamConfig)
     loss: LossWeights = field(default_factory=LossWeights)
     # Weight of the penalty on needle-shaped Gaussians: the mean excess of log(longest / middle
@@ -160,24 +119,20 @@ class IterationResult:
     visible: VisibleGaussians
 
 
-class Views(Protocol):
-    """Interface to training views by keyframe; the optimizer writes new exposures and poses."""
-
-    def __getitem__(self, keyframe: int) -> TrainingView: ...
-
-    def __setitem__(self, keyframe: int, view: TrainingView) -> None: ...
-
-
 class GaussianOptimizer:
     """Optimizer of Gaussians, exposures and keyframe poses; moments persist between calls.
 
-    The same map, training views and plan give bitwise equal results for any number of threads. Not
+    The same map, training views and plan give bitwise equal results for any number of threads. If
+    a GPU fails, the CPU runs the current plan again and continues with all later ones. Not
     thread-safe.
 
     Args:
         config: Settings.
         threads: Number of threads.
-        backend: Computation of the iterations; None for the C++ kernels.
+        backend: Computation of the iterations; None for that of `config.device`.
+
+    Attributes:
+        device: Device of the iterations, with the reason for its choice.
     """
 
     def __init__(
@@ -188,7 +143,11 @@ class GaussianOptimizer:
         backend: OptimizerBackend | None = None,
     ) -> None:
         self.config = config = config or GaussianOptimizerConfig()
-        self._backend = backend or CpuBackend(config.adam, config.loss, config.limits)
+        if backend is None:
+            chosen = choose_backend(config.device, config.adam, config.loss, config.limits)
+            self._backend, self.device = chosen
+        else:
+            self._backend, self.device = backend, given(backend)
         self._backend.threads = threads
         self._poses = PoseAdam()
 
@@ -239,13 +198,59 @@ class GaussianOptimizer:
         Returns:
             Loss before each step, for the iterations that were run.
         """
-        self._backend.begin(gaussians)
-        try:
-            return self._run(views, plan, rates, fixed, effort, starts_half, observe, is_usable)
-        finally:
-            self._backend.end()
+        options = rates, fixed, effort, starts_half
+        if self._backend.can_fail:
+            attempt, poses = PlanAttempt(views, observe), self._poses.snapshot()
+            try:
+                losses = self._run(gaussians, attempt, plan, *options, attempt.observe, is_usable)
+            except DeviceError as error:
+                attempt.undo()
+                self._poses.restore(poses)
+                self._continue_on_cpu(error)
+            else:
+                attempt.commit()
+                return losses
+        return self._run(gaussians, views, plan, *options, observe, is_usable)
+
+    def _continue_on_cpu(self, error: DeviceError) -> None:
+        self._backend, self.device = self._backend.on_cpu(), self.device.failed(error)
+        log.error(
+            "mapper: %s The CPU fits the map from now on, and no keyframe is lost. Restart the "
+            "service to use the GPU again.",
+            self.device.reason,
+        )
 
     def _run(
+        self,
+        gaussians: GaussianMap,
+        views: Views,
+        plan: Sequence[int],
+        rates: tuple[float, float],
+        fixed: int | None,
+        effort: float,
+        starts_half: bool,
+        observe: Observer | None,
+        is_usable: Callable[[int], bool],
+    ) -> list[ImageLoss]:
+        """Run a plan from `begin` to `end` of the backend; `optimize` describes the arguments.
+
+        Raises:
+            DeviceError: The device failed. The map and the moments of its Gaussians are unchanged.
+        """
+        self._backend.begin(gaussians)
+        try:
+            losses = self._iterate(
+                views, plan, rates, fixed, effort, starts_half, observe, is_usable
+            )
+        except DeviceError:
+            raise  # The map stays as it was at `begin`.
+        except BaseException:
+            self._backend.end()
+            raise
+        self._backend.end()
+        return losses
+
+    def _iterate(
         self,
         views: Views,
         plan: Sequence[int],
@@ -266,7 +271,7 @@ class GaussianOptimizer:
             view = views[keyframe]
             side_px = min(view.camera.width, view.camera.height)
             is_half = spent < half_effort and side_px >= MIN_HALVED_PX
-            step = self._iterate(view, rate, keyframe == fixed, is_half)
+            step = self._step(view, rate, keyframe == fixed, is_half)
             if step.view is not view:
                 views[keyframe] = step.view
             if observe is not None:
@@ -296,11 +301,11 @@ class GaussianOptimizer:
         """
         self._backend.begin(gaussians)
         try:
-            return self._iterate(view, rate, is_fixed, is_half)
+            return self._step(view, rate, is_fixed, is_half)
         finally:
             self._backend.end()
 
-    def _iterate(
+    def _step(
         self, view: TrainingView, rate: float, is_fixed: bool, is_half: bool
     ) -> IterationResult:
         self._backend.render(view, is_half=is_half)

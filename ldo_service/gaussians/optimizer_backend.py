@@ -38,16 +38,30 @@ class OptimizerBackend(Protocol):
     iteration, and then `end`. In between, only the backend reads or writes the rows of the map.
 
     Attributes:
-        threads: Number of threads; it may change between calls and does not change the results.
+        can_fail: Whether the methods from `begin` to `end` may raise DeviceError. The map and the
+            moments are then as they were at `begin`, and the visible Gaussians of all iterations
+            stay valid.
     """
 
-    threads: int
+    can_fail: bool
+
+    @property
+    def threads(self) -> int:
+        """Number of threads; it may change between calls and does not change the results."""
+        ...
+
+    @threads.setter
+    def threads(self, count: int) -> None: ...
 
     def begin(self, gaussians: GaussianMap) -> None:
         """Prepare iterations on a map."""
 
     def end(self) -> None:
         """Write the results of the iterations to the map, if they are not there yet."""
+
+    def on_cpu(self) -> "CpuBackend":
+        """Return a backend on the CPU that continues with the state of the last `end`."""
+        ...
 
     def render(self, view: TrainingView, *, is_half: bool) -> None:
         """Render the map at the pose of a view, with `is_half` at half resolution."""
@@ -96,6 +110,8 @@ class CpuBackend:
         threads: Number of threads.
     """
 
+    can_fail: bool = False
+
     def __init__(
         self, adam: AdamConfig, weights: LossWeights, limits: ShapeLimits, *, threads: int = 1
     ) -> None:
@@ -119,6 +135,9 @@ class CpuBackend:
 
     def end(self) -> None:
         self._gaussians = self._rendered = None
+
+    def on_cpu(self) -> "CpuBackend":
+        return self
 
     def render(self, view: TrainingView, *, is_half: bool) -> None:
         image = view.halved() if is_half else view

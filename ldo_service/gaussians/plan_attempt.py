@@ -1,0 +1,63 @@
+"""Attempt to run a plan of the optimizer on a device that may fail in between."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+
+from .exposure import Exposure
+from .renderer import VisibleGaussians
+from .training_views import TrainingView
+
+Observer = Callable[[int, VisibleGaussians], None]
+
+
+class Views(Protocol):
+    """Interface to training views by keyframe; the optimizer writes new exposures and poses."""
+
+    def __getitem__(self, keyframe: int) -> TrainingView: ...
+
+    def __setitem__(self, keyframe: int, view: TrainingView) -> None: ...
+
+
+class PlanAttempt:
+    """Views and observations of a plan, which can be undone if the device fails.
+
+    Reads and writes go to the views. The observer receives nothing before `commit`.
+
+    Args:
+        views: Training views by keyframe.
+        observe: Observer of the plan; None for none.
+    """
+
+    def __init__(self, views: Views, observe: Observer | None) -> None:
+        self._views, self._observer = views, observe
+        self._before: dict[int, tuple[np.ndarray, Exposure]] = {}
+        self._observed: list[tuple[int, VisibleGaussians]] = []
+
+    def __getitem__(self, keyframe: int) -> TrainingView:
+        view = self._views[keyframe]
+        self._before.setdefault(keyframe, (view.T_map_camera.copy(), view.exposure))
+        return view
+
+    def __setitem__(self, keyframe: int, view: TrainingView) -> None:
+        self._views[keyframe] = view
+
+    def observe(self, keyframe: int, visible: VisibleGaussians) -> None:
+        """Keep an observation for `commit`."""
+        if self._observer is not None:
+            self._observed.append((keyframe, visible))
+
+    def commit(self) -> None:
+        """Pass all observations to the observer."""
+        for keyframe, visible in self._observed:
+            assert self._observer is not None
+            self._observer(keyframe, visible)
+
+    def undo(self) -> None:
+        """Restore poses and exposures of the views, and drop the observations."""
+        self._observed.clear()
+        for keyframe, (T_map_camera, exposure) in self._before.items():
+            view = self._views[keyframe]
+            self._views[keyframe] = replace(view, T_map_camera=T_map_camera, exposure=exposure)
