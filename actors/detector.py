@@ -81,8 +81,7 @@ class Detector(Actor):
             if not self._is_failing:
                 log.error(
                     "detector: inference with the network %s failed: %s Keyframes get no "
-                    "detections until inference succeeds. If inference.providers names a GPU, try "
-                    "inference.providers=[cpu].",
+                    "detections until inference succeeds.",
                     self._network.identity,
                     error,
                 )
@@ -100,6 +99,7 @@ class Detector(Actor):
             "networks_missing": float(bool(self.config.model) and self._network is None),
             "inferences_failed": self._failures,
             "boxes": self._boxes,
+            **(self._network.metrics() if self._network else {}),
         }
 
 

@@ -32,8 +32,7 @@ class NetworkConfig:
     max_boxes: int = 100
     # Maximum boxes before non-maximum suppression, to bound the time of the suppression.
     max_candidates: int = 1000
-    # Execution providers of onnxruntime, by preference: cuda, tensorrt, ...
-    providers: tuple[str, ...] = ("cpu",)
+    device: str = "cpu"  # Setting `service.device`.
     threads: int = 1  # Threads of one inference; with 1, a replay is bitwise equal.
 
     def __post_init__(self) -> None:
@@ -114,7 +113,7 @@ class OnnxDetector:
         if self.config.names:
             names = read_names(Path(self.config.names).expanduser())
         try:
-            self._network = Network(path, self.config.providers, self.config.threads)
+            self._network = Network(path, self.config.device, self.config.threads)
             self._input, self.input_px = _image_input(self._network, self.config.input_px)
             output = self._output(_noise(self.input_px))
             self._head = detect_layout(output, self.input_px, self.config.layout)
@@ -135,6 +134,10 @@ class OnnxDetector:
     def providers(self) -> list[str]:
         """Execution providers that the network runs on, by onnxruntime's names, preferred first."""
         return self._network.providers
+
+    def metrics(self) -> dict[str, float]:
+        """Return whether the network runs on a GPU, and whether a device failed."""
+        return self._network.metrics()
 
     def detect(self, image: np.ndarray) -> Detections:
         """Return the objects in an image [H, W, 3] uint8 RGB.

@@ -1,4 +1,4 @@
-"""Session of an ONNX file: execution providers, inputs, outputs and metadata."""
+"""Session of an ONNX file: device, inputs, outputs and metadata."""
 
 import hashlib
 import logging
@@ -9,35 +9,48 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.errors import ConfigError, ModelError
+from ldo_service.errors import DeviceError, ModelError
 
 log = logging.getLogger(__name__)
 
-SUFFIX = "ExecutionProvider"
-CPU = "CPU" + SUFFIX
+CPU, CUDA = "CPUExecutionProvider", "CUDAExecutionProvider"
+PROVIDERS = {"cuda": CUDA, "openvino": "OpenVINOExecutionProvider"}  # By `service.device`.
+# Options of execution providers, so that results do not depend on timing: without TF32, and without
+# a search for the fastest convolution.
+OPTIONS = {CUDA: {"use_tf32": "0", "cudnn_conv_algo_search": "HEURISTIC"}}
+MEMORY = {CUDA: "cuda"}  # Memory of inputs and outputs by execution provider; otherwise "cpu".
+# Largest difference between the outputs of GPU and CPU, relative to 1 + |output|. Rounding causes
+# less than a tenth of it.
+TOLERANCE = 1e-2
 # Prefix of onnxruntime's error messages.
 _SUGAR = re.compile(r"^\[ONNXRuntimeError\] : \d+ : \w+ : (Load model from .*? failed: ?)?")
 
 
 class Network:
-    """Network of an ONNX file, opened in a session of onnxruntime."""
+    """Network of an ONNX file, opened in a session of onnxruntime.
 
-    def __init__(self, path: Path, providers: Sequence[str] = ("cpu",), threads: int = 1) -> None:
+    If another device than the CPU fails, or differs from the CPU in its first inference, the
+    inference is repeated on the CPU, which also runs all later ones.
+
+    Attributes:
+        has_failed: The CPU replaces another device that was found or asked for.
+    """
+
+    def __init__(self, path: Path, device: str = "cpu", threads: int = 1) -> None:
         """Open a network.
 
         Args:
             path: The ONNX file.
-            providers: Execution providers by preference, by onnxruntime's names or short names:
-                cpu, cuda, tensorrt, openvino. A provider that this machine lacks is ignored with a
-                warning. The CPU is added as the last provider unless it is given.
+            device: Setting `service.device`. With auto, a GPU is used if onnxruntime supports it.
+                With cuda or openvino, a missing execution provider causes a warning.
             threads: Threads of one inference; with 1, the CPU gives bitwise equal results in every
                 run.
 
         Raises:
-            ConfigError: If onnxruntime has no provider of a given name.
             ModelError: If the file does not exist or is not an ONNX network.
         """
-        wanted = available(providers)
+        wanted = providers_of(device)
+        self._path, self._threads = path, threads
         if not path.is_file():
             raise ModelError(f"{path} does not exist. Give the path of an ONNX file.")
         try:
@@ -47,7 +60,11 @@ class Network:
                 f"the file is no network in ONNX: {_first_line(error)}. Export the network to ONNX "
                 "again."
             ) from error
+        self._is_tested = False  # The first inference on a GPU has agreed with the CPU.
+        self._inputs: dict[str, Any] = {}  # Input buffers in the memory of the device, by name.
+        self.has_failed = device in PROVIDERS and wanted[0] != PROVIDERS[device]
         if self.providers[0] != wanted[0]:
+            self.has_failed = True
             log.warning(
                 "%s: execution provider %s cannot run this network, which now runs on %s; no "
                 "action needed unless it is too slow.",
@@ -90,7 +107,12 @@ class Network:
             ModelError: If the inference fails or an output has NaN or infinity.
         """
         try:
-            outputs = [np.asarray(output) for output in self._session.run(None, inputs)]
+            if self.providers[0] != CPU:
+                try:
+                    return self._run_on_device(inputs)
+                except DeviceError as error:
+                    self._continue_on_cpu(error)
+            outputs = self._run(inputs)
         except Exception as error:
             raise ModelError(
                 f"the inference of the network fails: {_first_line(error)}. Export the network "
@@ -102,6 +124,59 @@ class Network:
             )
         return outputs
 
+    def metrics(self) -> dict[str, float]:
+        """Return `device_failed`, which is 1 if the CPU replaces another device, and `on_gpu`."""
+        on_gpu = self.providers[0] == CUDA
+        return {"device_failed": float(self.has_failed), "on_gpu": float(on_gpu)}
+
+    def _run(self, inputs: dict[str, np.ndarray]) -> list[np.ndarray]:
+        """Run an inference with inputs and outputs bound to the memory of the device."""
+        from onnxruntime import OrtValue
+
+        memory, binding = MEMORY.get(self.providers[0], "cpu"), self._session.io_binding()
+        for name, values in inputs.items():
+            buffer = self._inputs.get(name)
+            if buffer is None or buffer.shape() != list(values.shape):
+                buffer = OrtValue.ortvalue_from_shape_and_type(values.shape, values.dtype, memory)
+                self._inputs[name] = buffer
+            buffer.update_inplace(np.ascontiguousarray(values))
+            binding.bind_ortvalue_input(name, buffer)
+        for output in self._session.get_outputs():
+            binding.bind_output(output.name, memory)
+        self._session.run_with_iobinding(binding)
+        return [np.asarray(output) for output in binding.copy_outputs_to_cpu()]
+
+    def _run_on_device(self, inputs: dict[str, np.ndarray]) -> list[np.ndarray]:
+        """Run an inference on another device than the CPU.
+
+        Raises:
+            DeviceError: The device fails, or its results are wrong.
+        """
+        try:
+            outputs = self._run(inputs)
+        except Exception as error:
+            raise DeviceError(f"the inference fails: {_first_line(error)}.") from error
+        if not all(np.isfinite(output).all() for output in outputs):
+            raise DeviceError("the outputs are NaN or infinity.")
+        if self.providers[0] == CUDA and not self._is_tested:
+            wanted = _session(self._path, [CPU], self._threads).run(None, inputs)
+            for output, expected in zip(outputs, wanted, strict=True):
+                if not np.allclose(output, expected, rtol=TOLERANCE, atol=TOLERANCE):
+                    raise DeviceError("the outputs of the first inference differ from the CPU.")
+            self._is_tested = True
+        return outputs
+
+    def _continue_on_cpu(self, error: DeviceError) -> None:
+        log.warning(
+            "%s: %s cannot run this network: %s The CPU repeats the inference and runs all later "
+            "ones. Restart the service to use the device again.",
+            self._path,
+            self.providers[0],
+            error,
+        )
+        self._session, self.has_failed = _session(self._path, [CPU], self._threads), True
+        self._inputs.clear()
+
 
 def sha256(path: Path) -> str:
     """Return the SHA-256 checksum of a file in hexadecimal."""
@@ -109,47 +184,33 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def available(names: Sequence[str]) -> list[str]:
-    """Return those of the given execution providers that this machine has.
+def providers_of(device: str) -> list[str]:
+    """Return the execution providers of a device that this machine has, by preference.
 
     Args:
-        names: Names of providers, by preference, as onnxruntime's or short names.
+        device: Setting `service.device`.
 
     Returns:
-        Names of the providers in onnxruntime, in the order of `names`; the CPU is last unless it
-        was given.
-
-    Raises:
-        ConfigError: If onnxruntime has no provider of a given name.
+        Names of the providers in onnxruntime; the last one is that of the CPU.
     """
     import onnxruntime  # Imported in functions only, because the import slows the start of `ldo`.
 
-    wanted = [_full_name(name) for name in names]
     here = onnxruntime.get_available_providers()
-    for name in wanted:
-        if name not in here:
-            log.warning(
-                "execution provider %s is missing from the installed onnxruntime, which has %s; "
-                "networks run on the other providers. To use the missing one, install a package "
-                "such as onnxruntime-gpu.",
-                name,
-                ", ".join(here),
-            )
-    found = [name for name in wanted if name in here]
-    return list(dict.fromkeys([*found, CPU]))
-
-
-def _full_name(name: str) -> str:
-    """Return onnxruntime's name of a provider, such as CUDAExecutionProvider for cuda."""
-    import onnxruntime
-
-    known = {full.removesuffix(SUFFIX).casefold(): full for full in onnxruntime.get_all_providers()}
-    short = name.casefold().removesuffix(SUFFIX.casefold())
-    if short not in known:
-        raise ConfigError(
-            f"onnxruntime knows no execution provider {name!r}. Choose from {', '.join(known)}."
+    wanted = PROVIDERS.get("cuda" if device == "auto" else device, CPU)
+    if wanted in here:
+        return list(dict.fromkeys([wanted, CPU]))
+    if device != "auto":
+        log.warning(
+            "service.device=%s: execution provider %s is missing from the installed onnxruntime, "
+            "which has %s; networks run on the CPU. To use %s, install onnxruntime-%s instead of "
+            "onnxruntime.",
+            device,
+            wanted,
+            ", ".join(here),
+            device,
+            {"cuda": "gpu"}.get(device, device),
         )
-    return known[short]
+    return [CPU]
 
 
 def _session(path: Path, providers: Sequence[str], threads: int) -> Any:
@@ -160,7 +221,8 @@ def _session(path: Path, providers: Sequence[str], threads: int) -> Any:
     options.inter_op_num_threads = 1
     options.use_deterministic_compute = True
     options.log_severity_level = 4  # Log fatal errors only; other errors are raised.
-    return onnxruntime.InferenceSession(str(path), options, providers=providers)
+    chosen = [(name, OPTIONS.get(name, {})) for name in providers]
+    return onnxruntime.InferenceSession(str(path), options, providers=chosen)
 
 
 def _first_line(error: Exception) -> str:

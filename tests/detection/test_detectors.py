@@ -218,19 +218,20 @@ def test_box_count_identifies_the_grid(input_px: tuple[int, int]) -> None:
             assert set(grid.strides_px.ravel()) == set(subset)
 
 
-# --- execution providers --------------------------------------------------------------------------
-def test_unknown_provider_raises_with_list_of_known_ones(tmp_path) -> None:
-    with pytest.raises(ConfigError, match=r"knows no execution provider 'gpu'.*cuda.*cpu"):
-        open_detector(tmp_path, "yolov8", NetworkConfig(providers=("gpu",)))
-
-
-def test_unavailable_provider_is_skipped_with_a_warning(tmp_path, caplog) -> None:
-    detector = open_detector(
-        tmp_path, "yolov8", NetworkConfig(providers=("rknpu", "CPUExecutionProvider"))
-    )
+# --- devices --------------------------------------------------------------------------------------
+def test_missing_device_is_replaced_by_the_cpu_with_a_warning(tmp_path, caplog) -> None:
+    detector = open_detector(tmp_path, "yolov8", NetworkConfig(device="openvino"))
     assert detector.providers == ["CPUExecutionProvider"]
     (record,) = caplog.records
-    assert "RknpuExecutionProvider is missing from the installed onnxruntime" in record.getMessage()
+    assert "OpenVINOExecutionProvider is missing from the installed onnx" in record.getMessage()
+    assert detector.metrics() == {"device_failed": 1, "on_gpu": 0}
+
+
+def test_auto_without_a_gpu_is_the_cpu_without_a_warning(tmp_path, caplog) -> None:
+    detector = open_detector(tmp_path, "yolov8", NetworkConfig(device="auto"))
+    assert detector.providers == ["CPUExecutionProvider"]
+    assert not caplog.records
+    assert detector.metrics() == {"device_failed": 0, "on_gpu": 0}
 
 
 # --- real networks --------------------------------------------------------------------------------

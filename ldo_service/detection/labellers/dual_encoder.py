@@ -53,8 +53,7 @@ class DualEncoderConfig:
     # Names of what is no object, such as wall and floor. Each has a probability like all other
     # names, and a region for which one of them is the most probable gets no label.
     nothing: tuple[str, ...] = ()
-    # Execution providers of onnxruntime, by preference: cuda, tensorrt, ...
-    providers: tuple[str, ...] = ("cpu",)
+    device: str = "cpu"  # Setting `service.device`.
     threads: int = 1  # Threads of one inference; with 1, a replay is bitwise equal.
 
     def __post_init__(self) -> None:
@@ -203,7 +202,7 @@ class DualEncoder:
             self._listed[canonical(name)] = name
 
     def metrics(self) -> dict[str, float]:
-        return {"names": len(self.names)}
+        return {"names": len(self.names), **self._image.metrics()}
 
     def _view(self, crop: np.ndarray, rows: np.ndarray) -> list[ScoredLabel]:
         """Return the probability of each name for one crop, given the embeddings of all names."""
@@ -252,7 +251,7 @@ class ImageEncoder:
     """Network that computes an embedding [1, D] of an image [1, 3, S, S]."""
 
     def __init__(self, path: Path, config: DualEncoderConfig) -> None:
-        self._network = Network(path, config.providers, config.threads)
+        self._network = Network(path, config.device, config.threads)
         self._input, self.side_px = _square_input(self._network)
         mean = config.mean or self.metadata_numbers("mean", 3) or CLIP_MEAN
         std = config.std or self.metadata_numbers("std", 3) or CLIP_STD
@@ -271,6 +270,10 @@ class ImageEncoder:
         return unit(
             only_embedding(self._network.run(**{self._input: np.ascontiguousarray(planes)}))
         )
+
+    def metrics(self) -> dict[str, float]:
+        """Return whether the network runs on a GPU, and whether a device failed."""
+        return self._network.metrics()
 
     def metadata_numbers(self, key: str, count: int) -> tuple[float, ...]:
         """Return `count` numbers from an entry of the network's metadata; empty without this entry.
@@ -301,7 +304,7 @@ class ImageEncoder:
 def _text_encoder(pair: EncoderFiles, config: DualEncoderConfig) -> TextEncoder | None:
     if pair.text is None or pair.vocabulary is None:
         return None
-    network = Network(pair.text, config.providers, config.threads)
+    network = Network(pair.text, config.device, config.threads)
     return TextEncoder(network, read_tokenizer(pair.vocabulary), config.prompts)
 
 
