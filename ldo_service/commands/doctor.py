@@ -17,7 +17,10 @@ from ldo_service import __version__, kernels
 from ldo_service.actors.topology import GRAPH
 from ldo_service.client import connect
 from ldo_service.detection.model_registry import Models
+from ldo_service.detection.onnx_network import CUDA, providers_of
 from ldo_service.errors import ConfigError, ModelError, install_command
+from ldo_service.gaussians import GaussianOptimizerConfig
+from ldo_service.gaussians.device_choice import choose_backend
 from ldo_service.schemas import Health
 from ldo_service.schemas.topics import HEALTH
 from ldo_service.service.diagnostics import ActorStatus, diagnose, notes
@@ -54,8 +57,10 @@ EXTRAS = {  # Optional extra of the package: modules that it installs.
     "cluster": ("ray", "s3fs"),
     "cuda": ("torch", "triton"),
 }
-# Extras that have no use for users yet.
-EXPERIMENTAL = {"cuda": "Its GPU kernels are experimental, and the service does not use them yet"}
+# Extras that are experimental.
+EXPERIMENTAL = {
+    "cuda": "Mapping on a GPU is experimental until `ldo bench --device cuda` has passed on it"
+}
 REINSTALL = "`.venv/bin/pip install -e .` in the clone of LDO-SLAM installs all libraries."
 LISTEN_S = 1.5  # Three heartbeats.
 Check = Annotated[
@@ -107,7 +112,7 @@ def doctor(
         return
     show(
         (
-            *(*machine(), *libraries(), *extras(), *networks()),
+            *(*machine(), *libraries(), *extras(), *devices(), *networks()),
             *(*certificates(endpoint, keys), *service(robot, endpoint, keys)),
         )
     )
@@ -147,6 +152,24 @@ def extras() -> Iterator[Finding]:
             yield Finding("absent", f"extra {extra} (missing: {', '.join(missing)}): {advice}")
         else:
             yield Finding("ok", f"extra {extra}{note}")
+
+
+def devices() -> Iterator[Finding]:
+    """Report the devices that `service.device=auto` chooses on this machine, and why."""
+    defaults = GaussianOptimizerConfig()
+    _, choice = choose_backend("auto", defaults.adam, defaults.loss, defaults.limits)
+    yield Finding(
+        "warn" if choice.has_failed else "ok",
+        f"service.device=auto chooses {choice.device} ({choice.name}) for the mapper: "
+        f"{choice.reason}",
+    )
+    on_gpu = providers_of("auto")[0] == CUDA
+    device, has = ("cuda", "has") if on_gpu else ("cpu", "lacks")
+    yield Finding(
+        "ok",
+        f"service.device=auto chooses {device} for the networks: the installed onnxruntime {has} "
+        f"{CUDA}",
+    )
 
 
 def networks() -> Iterator[Finding]:

@@ -4,13 +4,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from ldo_service.config import Config, known_presets
+from ldo_service.config import Config, checked, known_presets
 from ldo_service.runs.job import Advance
 from ldo_service.synthetic import SCENES
 from ldo_service.tracking.localizer import load_keyframe_database
@@ -46,6 +46,14 @@ Preset = Annotated[
         metavar="NAME",
         help="replace default settings by those of the preset NAME, before --config and --set; "
         + "; ".join(f"{name}: {about}" for name, about in known_presets().items()),
+    ),
+]
+Device = Annotated[
+    Literal["auto", "cpu", "cuda"] | None,
+    argument(
+        metavar="auto|cpu|cuda",
+        help="device of mapper and networks, instead of service.device; auto uses a GPU if it "
+        "passes a self-test (experimental)",
     ),
 ]
 Source = Annotated[
@@ -133,6 +141,13 @@ Json = Annotated[bool, argument(help="print one JSON document and nothing else")
 def with_preset(settings: tuple[str, ...], preset: str) -> tuple[str, ...]:
     """Return the settings of --set, preceded by one that selects the preset of --preset, if any."""
     return (f"preset={preset}", *settings) if preset else settings
+
+
+def with_device(config: Config, device: str | None) -> Config:
+    """Return the configuration with the device of --device; None keeps the configured device."""
+    if device is None:
+        return config
+    return checked(replace(config, service=replace(config.service, device=device)))
 
 
 def with_topics(settings: tuple[str, ...], topics: tuple[str, ...]) -> tuple[str, ...]:

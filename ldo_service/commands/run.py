@@ -23,6 +23,7 @@ from ldo_service.runs.source import Selection, recorded_prior
 
 from .options import (
     ConfigFile,
+    Device,
     HoldOutEvery,
     Localize,
     MaxFrames,
@@ -36,6 +37,7 @@ from .options import (
     argument,
     localizing,
     progress,
+    with_device,
     with_preset,
     with_topics,
 )
@@ -101,6 +103,7 @@ def run(
             "frames, to compare settings of the other actors on equal poses",
         ),
     ] = None,
+    device: Device = None,
     realtime: Annotated[
         bool, argument(help="send frames at the times of their stamps, and drop late ones")
     ] = False,
@@ -139,6 +142,7 @@ def run(
         ),
         localize,
     )
+    settings = with_device(settings, device)
     require_usable_networks(settings)
     selection = Selection(stride, max_frames)
     require_held_out(stride, settings.tracker.hold_out)

@@ -18,6 +18,7 @@ from ldo_service.transport.keys import OF_SERVICE, TlsKeys
 from .options import (
     ActorNames,
     ConfigFile,
+    Device,
     EndpointAddress,
     KeysFolder,
     Localize,
@@ -27,6 +28,7 @@ from .options import (
     StateFolder,
     argument,
     localizing,
+    with_device,
     with_preset,
 )
 
@@ -60,6 +62,7 @@ def serve(
     client: Client = False,
     metrics_port: MetricsPort = None,
     preset: Preset = "",
+    device: Device = None,
 ) -> None:
     """Run the service: receive frames on camera/rgbd; publish poses, map, objects and health.
 
@@ -70,6 +73,7 @@ def serve(
       ldo publish synthetic:room --rate 15      (in another terminal)
     """
     settings = localizing(load_config(config, with_preset(set, preset)), localize)
+    settings = with_device(settings, device)
     is_local = endpoint.startswith(f"{LOCAL}/")  # A child process of a service with keys.
     folder_of_keys = None if is_local else TlsKeys.of(keys or settings.service.keys or None)
     network = Endpoint(robot, endpoint, folder_of_keys, settings.service.max_message_mb)
@@ -113,6 +117,7 @@ def record(
     client: Client = False,
     metrics_port: MetricsPort = None,
     preset: Preset = "",
+    device: Device = None,
 ) -> None:
     """Run the service as `ldo serve` does, and record the inputs of every actor.
 
@@ -134,4 +139,5 @@ def record(
         client=client,
         metrics_port=metrics_port,
         preset=preset,
+        device=device,
     )

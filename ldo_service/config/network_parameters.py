@@ -22,7 +22,7 @@ def detector_parameters(config: Config) -> DetectorConfig:
             score_min=detector.min_score,
             nms_iou=detector.nms_iou,
             max_boxes=detector.max_detections,
-            providers=config.inference.providers,
+            device=config.service.device,
             threads=config.inference.threads,
         ),
     )
@@ -42,7 +42,7 @@ def labeller_parameters(config: Config) -> VlmLabellerConfig:
             std=encoder.image_std,
             logit_scale=encoder.logit_scale,
             nothing=encoder.background_names,
-            providers=config.inference.providers,
+            device=config.service.device,
             threads=config.inference.threads,
         ),
         http=HttpConfig(

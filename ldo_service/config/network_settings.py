@@ -46,9 +46,7 @@ class DetectorSettings:
 class InferenceSettings:
     """Inference of the detector's network and of the labeller's encoders."""
 
-    # Execution providers of onnxruntime in order of preference, such as cuda or tensorrt.
-    providers: tuple[str, ...] = ("cpu",)
-    # Threads of one inference. With 1, a replay gives identical bits.
+    # Threads of one inference on the CPU. With 1, a replay gives identical bits.
     threads: PositiveInt = 1
 
 

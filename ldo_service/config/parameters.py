@@ -223,6 +223,7 @@ def _map_builder(config: Config) -> MapBuilderConfig:
             coarsest_px=mapper.densify.max_cell_px,
         ),
         optimizer=GaussianOptimizerConfig(
+            device=config.service.device,
             adam=AdamConfig(
                 mean_m=rates.mean_m,
                 log_scale=rates.log_scale,

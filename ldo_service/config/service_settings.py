@@ -9,6 +9,7 @@ from msgspec import Meta
 
 from ldo_service.datasets import SequenceOptions
 from ldo_service.errors import ConfigError
+from ldo_service.gaussians.device_choice import Device
 from ldo_service.transport.endpoint import LOOPBACK, MAX_MESSAGE_MB
 
 from .values import (
@@ -110,8 +111,12 @@ class OfflineSettings:
 
 @dataclass(frozen=True, slots=True)
 class ServiceSettings:
-    """Live service (`ldo serve`)."""
+    """Live service (`ldo serve`), and the device that computes map and networks."""
 
+    # Device of the mapper's optimizer and of the networks. auto uses a GPU if it passes a
+    # self-test, and the CPU otherwise. Mapping on a GPU is experimental. openvino applies to the
+    # networks alone.
+    device: Device = "cpu"
     # Actors that run in processes of their own. The default is the actor that uses gtsam, which
     # holds the GIL during every call.
     process_actors: tuple[str, ...] = ("optimizer",)

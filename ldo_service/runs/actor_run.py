@@ -102,12 +102,11 @@ class ActorRun:
             used: Time that the frames took.
             is_finished: False if the run was interrupted.
         """
-        names = [name for name in ("tracker", "optimizer", "mapper") if name in self.actors]
-        facts = {k: v for name in names for k, v in self.actors[name].metrics().items()}
+        metrics = {name: actor.metrics() for name, actor in self.actors.items()}
         stage_ms = self._stage_ms or self._step_percentiles()
         if source := self.actors.get("frame_source"):
             rejected += int(source.metrics()["frames_rejected"])
-        summary = summarize(self.record, used, frames, rejected, stage_ms, {}, facts)
+        summary = summarize(self.record, used, frames, rejected, stage_ms, {}, metrics)
         return {**summary, "interrupted": not is_finished}
 
     def _observe(self, _actor: str, message: Message, step_ms: float) -> None:

@@ -125,13 +125,9 @@ class _RealTimeRun:
         stage_ms = {h.actor: {"p50": h.step_ms_p50, "p95": h.step_ms_p95} for h in healths}
         drops = {f"{h.actor} {i.topic}": i.dropped for h in healths for i in h.inputs if i.dropped}
         frames = len(self._indices)
-        facts = {
-            name: value
-            for health in healths
-            if health.actor in ("tracker", "optimizer", "mapper")
-            for name, value in health.metrics.items()
-        }
-        self._record.close(summarize(self._record, used, frames, rejected, stage_ms, drops, facts))
+        metrics = {health.actor: health.metrics for health in healths}
+        summary = summarize(self._record, used, frames, rejected, stage_ms, drops, metrics)
+        self._record.close(summary)
         require_usable(self._record, self._config.offline.max_rejected_ratio)
         return self._record
 

@@ -14,6 +14,7 @@ from ldo_service.actors.mapper import Mapper
 from ldo_service.actors.topology import actor_spec
 from ldo_service.config import Config, actor_parameters, config_of
 from ldo_service.errors import ConfigError, DataError
+from ldo_service.kernels.gpu.device import gpu_facts
 from ldo_service.recordings.recording import JournalFile, recorded_actors
 from ldo_service.recordings.replay import ReplayReport, replay
 from ldo_service.runtime import Actor
@@ -100,6 +101,18 @@ def _versions_of(about: Mapping[str, str]) -> dict[str, str]:
         ) from error
 
 
+def _gpu_caveat(about: Mapping[str, str]) -> list[str]:
+    """Return a note if this machine has another GPU than that of the recording."""
+    recorded = msgspec.json.decode(about.get("gpu", "{}"), type=dict[str, str])
+    if not recorded or recorded == gpu_facts("cuda"):
+        return []
+    facts = ", ".join(f"{name} {value}" for name, value in recorded.items())
+    return [
+        f"recorded with {facts}, which this machine lacks: the results of the mapper and of "
+        "networks may differ. Replay on an equal GPU with equal versions."
+    ]
+
+
 def _caveats(about: Mapping[str, str]) -> list[str]:
     lines: list[str] = []
     isa, ours = about.get("isa", kernels.isa()), kernels.isa()
@@ -108,6 +121,7 @@ def _caveats(about: Mapping[str, str]) -> list[str]:
             f"recorded with the instruction set {isa}, replayed with {ours}: the last bits may "
             f"differ. Set LDO_ISA={isa} on a machine with that instruction set."
         )
+    lines += _gpu_caveat(about)
     now = versions()
     for name, version in _versions_of(about).items():
         if now.get(name) != version:

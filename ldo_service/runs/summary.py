@@ -12,6 +12,7 @@ import numpy as np
 from ldo_service import kernels, versions
 from ldo_service.calibration import outlines
 from ldo_service.calibration.correction import BIAS_COVARIANCE
+from ldo_service.kernels.gpu.device import gpu_facts
 
 from .folder import RunWriter
 
@@ -52,7 +53,7 @@ def summarize(
     rejected: int,
     stage_ms: dict[str, Percentiles],
     drops: dict[str, int],
-    facts: Mapping[str, float],
+    metrics: Mapping[str, Mapping[str, float]],
 ) -> dict[str, Any]:
     """Return the summary of a finished run.
 
@@ -67,8 +68,10 @@ def summarize(
         rejected: Number of frames that could not be used.
         stage_ms: Percentiles of the step durations of each actor.
         drops: Number of dropped messages, by consumer and topic: "ACTOR TOPIC".
-        facts: Metrics of the pose-graph optimizer, the mapper and the tracker.
+        metrics: Metrics at the end, by actor.
     """
+    names = [name for name in ("tracker", "optimizer", "mapper") if name in metrics]
+    facts = {key: value for name in names for key, value in metrics[name].items()}
     in_map = record.in_map()
     return {
         "frames": frames,
@@ -98,8 +101,24 @@ def summarize(
         # Evidence of the self-calibration at the end; empty if the tracker did not run.
         "calibration": {name: facts[name] for name in CALIBRATION if name in facts},
         "isa": kernels.isa(),
+        **devices(metrics),
         "threads": os.cpu_count(),
         "versions": versions(),
+    }
+
+
+def devices(metrics: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
+    """Return the device of each actor that can use a GPU, and the GPU if any actor used it.
+
+    Args:
+        metrics: Metrics at the end, by actor.
+    """
+    on_gpu = {name: bool(found["on_gpu"]) for name, found in metrics.items() if "on_gpu" in found}
+    failed = sorted(name for name, found in metrics.items() if found.get("device_failed"))
+    return {
+        "devices": {name: "cuda" if on_gpu[name] else "cpu" for name in sorted(on_gpu)},
+        "devices_failed": failed,
+        "gpu": gpu_facts("cuda") if any(on_gpu.values()) else {},
     }
 
 

@@ -71,6 +71,7 @@ def diagnose(seen: ActorStatus, heartbeat_s: float = 0.5) -> Iterator[Problem]:
         yield from _of_backlogs(seen.health)
         yield from _of_disk(seen.health)
         yield from _of_models(seen.health)
+        yield from _of_device(seen.health)
 
 
 def _silent(how_long: str) -> Problem:
@@ -174,13 +175,22 @@ def _of_models(health: Health) -> Iterator[Problem]:
     if failed := facts.get("inferences_failed"):
         yield Problem(
             f"had {failed:.0f} failed inferences; these keyframes have no detections",
-            "the log of `ldo serve` has the first failure; try inference.providers=[cpu]",
+            "the log of `ldo serve` has the first failure",
         )
     if facts.get("labeller_failing"):
         yield Problem(
             "gets no results from its labeller; "
             f"{facts.get('labellings_failed', 0):.0f} regions so far have no label",
             "check the server at vlm_labeller.url; the log of `ldo serve` has the first failure",
+        )
+
+
+def _of_device(health: Health) -> Iterator[Problem]:
+    if health.metrics.get("device_failed"):
+        yield Problem(
+            "computes on the CPU, because the device of service.device is missing or failed",
+            "the log of `ldo serve` has the cause; fix it and restart the service, or set "
+            "service.device=cpu",
         )
 
 

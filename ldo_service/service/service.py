@@ -29,6 +29,7 @@ from ldo_service.config import (
 )
 from ldo_service.errors import ConfigError, DataError, LdoError
 from ldo_service.gaussians.map_builder import FILE_PATTERNS
+from ldo_service.kernels.gpu.device import gpu_facts
 from ldo_service.recordings.actor_files import ActorFiles
 from ldo_service.recordings.recorder import Recorder
 from ldo_service.recordings.recording import new_path, prepare_recording
@@ -84,6 +85,7 @@ def open_recorder(
         "robot": robot,
         "config": config_yaml(config),
         "isa": kernels.isa(),
+        "gpu": json.dumps(gpu_facts(config.service.device)),
         "versions": json.dumps(versions()),
     }
     try:

@@ -8,7 +8,9 @@ import msgspec
 import pytest
 
 from ldo_service.commands import doctor
-from ldo_service.errors import LdoError
+from ldo_service.errors import DeviceError, LdoError
+from ldo_service.kernels.gpu.arrays import HostArrays
+from ldo_service.kernels.gpu.device import Gpu
 from ldo_service.service.diagnostics import ActorStatus
 from ldo_service.transport.certificate_authority import CertificateAuthority
 from ldo_service.transport.endpoint import Endpoint
@@ -17,12 +19,14 @@ from ldo_service.transport.zenoh_transport import open_session
 from tests.ports import free_port
 from tests.service.test_diagnostics import health, inputs
 
+TRITON = importlib.util.find_spec("triton") is not None
+
 
 def test_missing_extra_is_named_with_its_install_command(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
-    for check in ("machine", "libraries", "networks", "service"):
+    for check in ("machine", "libraries", "devices", "networks", "service"):
         monkeypatch.setattr(doctor, check, lambda *_: ())
     doctor.doctor()
     out = capsys.readouterr().out
@@ -38,7 +42,7 @@ def test_missing_library_is_bad(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_bad_line_ends_with_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    for check in ("machine", "libraries", "extras", "networks"):
+    for check in ("machine", "libraries", "extras", "devices", "networks"):
         monkeypatch.setattr(doctor, check, lambda: ())
     monkeypatch.setattr(doctor, "service", lambda *_: [doctor.Finding("bad", "tracker stopped")])
     with pytest.raises(LdoError, match="problems found: 1"):
@@ -66,7 +70,46 @@ def test_extra_for_a_gpu_is_called_experimental(
     monkeypatch.setattr("importlib.util.find_spec", lambda _: found)
     (finding,) = [finding for finding in doctor.extras() if "extra cuda" in finding.text]
     assert finding.mark == mark
-    assert "experimental, and the service does not use them" in finding.text
+    assert "experimental until `ldo bench --device cuda` has passed" in finding.text
+
+
+def gpu(*_: object) -> Gpu:
+    return Gpu("Some GPU", {}, HostArrays())
+
+
+def missing_gpu() -> Gpu:
+    raise DeviceError("there is no GPU.")
+
+
+def fail(*_: object) -> None:
+    raise DeviceError("the loss differs.")
+
+
+def test_devices_without_a_gpu_are_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ldo_service.gaussians.device_choice.find_gpu", missing_gpu)
+    mapper, networks = doctor.devices()
+    assert (mapper.mark, networks.mark) == ("ok", "ok")
+    assert mapper.text.startswith("service.device=auto chooses cpu (")
+    assert mapper.text.endswith("for the mapper: there is no GPU.")
+    assert "chooses cpu for the networks" in networks.text
+
+
+@pytest.mark.skipif(not TRITON, reason="`make gpu-check` installs Triton")
+def test_gpu_that_fails_the_self_test_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ldo_service.gaussians.device_choice.find_gpu", gpu)
+    monkeypatch.setattr("ldo_service.gaussians.gpu_self_test.run_self_test", fail)
+    mapper, _ = doctor.devices()
+    assert mapper.mark == "warn"
+    assert mapper.text.endswith("the GPU Some GPU failed: the loss differs.")
+
+
+@pytest.mark.skipif(not TRITON, reason="`make gpu-check` installs Triton")
+def test_gpu_that_passes_the_self_test_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ldo_service.gaussians.device_choice.find_gpu", gpu)
+    monkeypatch.setattr("ldo_service.gaussians.gpu_self_test.run_self_test", lambda _: None)
+    mapper, _ = doctor.devices()
+    assert mapper.mark == "ok"
+    assert "chooses cuda (Some GPU) for the mapper: the GPU passed the self-test." in mapper.text
 
 
 @pytest.mark.parametrize(("days", "mark"), [(40, "ok"), (10, "warn")])

@@ -43,7 +43,7 @@ def test_value_shared_by_several_actors_is_set_once() -> None:
                 "tracker.features.max_features=500",
                 "tracker.relocalization.max_keyframes=77",
                 "detector.dynamic_classes=[robot]",
-                "inference.providers=[openvino]",
+                "service.device=openvino",
                 "inference.threads=3",
                 "paper.max_depth_gap_m=0.2",
             )
@@ -62,7 +62,8 @@ def test_value_shared_by_several_actors_is_set_once() -> None:
     assert tracker.movable == semantics.movable == parameters.loop_closer.movable
     assert tracker.movable.classes == ("robot",)
     networks = parameters.detector.network, parameters.vlm_labeller.dual_encoder
-    assert [(one.providers, one.threads) for one in networks] == [(("openvino",), 3)] * 2
+    assert [(one.device, one.threads) for one in networks] == [("openvino", 3)] * 2
+    assert parameters.mapper.builder.optimizer.device == "openvino"
     assignment, association = semantics.labelling.assignment, semantics.objects.association
     assert assignment.max_depth_gap_m == association.max_depth_gap_m == 0.2
     foreground = semantics.labelling.foreground

@@ -120,7 +120,7 @@ def other_values(setting: Setting) -> list[Any]:
         case float():
             return [setting.value * 0.9 or 0.5, setting.value * 1.1]
         case str():
-            rules = ["yolov8", "semantic", "fixed", "iou", "box", "paper", "one_sided"]
+            rules = ["yolov8", "semantic", "fixed", "iou", "box", "paper", "one_sided", "auto"]
             return ["elsewhere", *rules]
         case _:
             names = [["x {}"], ["optimizer"], ["color=/a"]]
