@@ -4,7 +4,7 @@ import json
 import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 import tyro
@@ -14,11 +14,13 @@ from rich.table import Column, Table
 from ldo_service import kernels
 from ldo_service.config import actor_parameters, load_config
 from ldo_service.datasets import open_sequence
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, DeviceError
 from ldo_service.evaluation.iteration import Iteration, bench_camera, iteration_times
+from ldo_service.geometry import Camera
+from ldo_service.kernels.gpu.device import MIN_CAPABILITY, Gpu, find_gpu
 from ldo_service.runs.map_benchmark import HeldOutErrors, MapMeasurement, TrackedSource
 
-from .options import ConfigFile, Settings, Source, argument, progress
+from .options import ConfigFile, Settings, Source, argument, progress, with_device
 
 Json = Annotated[bool, argument(name="json", help="print one JSON object")]
 
@@ -88,23 +90,36 @@ Verb = (
 )
 
 
-def bench(verb: Verb) -> None:
+@tyro.conf.configure(tyro.conf.CascadeSubcommandArgs)
+def bench(
+    verb: Verb = BenchRender(),
+    device: Annotated[
+        Literal["cpu", "cuda"],
+        argument(help="cuda: measure a GPU, and for `render` the CPU too (experimental)"),
+    ] = "cpu",
+) -> None:
     """Measure the speed of the Gaussian optimizer, or of the mapper on a source.
 
     Set the environment variable LDO_ISA to avx512, avx2 or baseline to choose the instruction set.
+    With --device cuda, the results of the GPU are compared with those of the CPU first. Nothing is
+    measured if they differ.
+
+      ldo bench
+      ldo bench --device cuda
     """
     match verb:
         case BenchRender():
-            bench_render(verb)
+            bench_render(verb, device)
         case BenchMap():
-            bench_map(verb)
+            bench_map(verb, device)
 
 
-def bench_render(verb: BenchRender) -> None:
+def bench_render(verb: BenchRender, device: str = "cpu") -> None:
     """Measure one iteration of the Gaussian optimizer, and print the times of its steps.
 
     Raises:
         ConfigError: A number is out of range.
+        DeviceError: With the device cuda, there is no GPU, or its results are wrong.
     """
     width, height = _pixels(verb.size)
     if not min(verb.gaussians, verb.threads, verb.repeats) >= 1:
@@ -117,6 +132,9 @@ def bench_render(verb: BenchRender) -> None:
             f"--gaussians-out-of-view {verb.gaussians_out_of_view} must be at least 0."
         )
     camera = bench_camera(width, height)
+    if device == "cuda":
+        bench_gpu_render(verb, camera)
+        return
     iteration = Iteration(
         verb.gaussians, camera, threads=verb.threads, elsewhere=verb.gaussians_out_of_view
     )
@@ -137,11 +155,64 @@ def bench_render(verb: BenchRender) -> None:
         console.print(_table(times))
 
 
-def bench_map(verb: BenchMap) -> None:
+def bench_gpu_render(verb: BenchRender, camera: Camera) -> None:
+    """Measure one iteration on a GPU and on the CPU, and print the times side by side.
+
+    Raises:
+        ConfigError: An option applies to the CPU alone.
+        DeviceError: There is no GPU, or its results are wrong.
+    """
+    if verb.gaussians_out_of_view:
+        raise ConfigError("--gaussians-out-of-view applies to --device cpu alone. Remove it.")
+    gpu = required_gpu()
+    # This module imports Triton, which is optional.
+    from ldo_service.evaluation.device_iteration import device_times
+
+    times = device_times(gpu.arrays, verb.gaussians, camera, verb.repeats, threads=verb.threads)
+    facts = {
+        "isa": kernels.isa(),
+        "gpu": gpu.name,
+        **gpu.versions,
+        "gaussians": verb.gaussians,
+        "width": camera.width,
+        "height": camera.height,
+        "threads": verb.threads,
+        "gpu_mb": times.gpu_mb,
+    }
+    if verb.json_:
+        print(json.dumps(asdict(times) | facts))
+        return
+    console = Console(highlight=False)
+    console.print("render: " + ", ".join(f"{name} {fact}" for name, fact in facts.items()))
+    columns = [Column(name, justify="right") for name in ("CPU ms", "GPU ms", "CPU / GPU")]
+    table = Table("step", *columns)
+    for name, gpu_ms in times.gpu_ms.items():
+        cpu_ms = times.cpu_ms[name]
+        table.add_row(name, f"{cpu_ms:.2f}", f"{gpu_ms:.2f}", f"{cpu_ms / gpu_ms:.2f}")
+    console.print(table)
+
+
+def required_gpu() -> Gpu:
+    """Return the GPU of this machine.
+
+    Raises:
+        DeviceError: There is none. The text says what the benchmark needs.
+    """
+    try:
+        return find_gpu()
+    except DeviceError as error:
+        raise DeviceError(
+            "the benchmark with --device cuda needs a GPU of NVIDIA with compute capability "
+            f"{MIN_CAPABILITY / 10:.1f} or higher, its driver, and the extra cuda: {error}"
+        ) from error
+
+
+def bench_map(verb: BenchMap, device: str = "cpu") -> None:
     """Measure the mapper on a source, and print the result beside a stored baseline.
 
     Raises:
         ConfigError: A number is out of range, or the baseline has other frames.
+        DeviceError: With the device cuda, there is no GPU, or its results are wrong.
     """
     if verb.frames < 2 or verb.refine_iterations < 0:
         raise ConfigError(
@@ -150,6 +221,9 @@ def bench_map(verb: BenchMap) -> None:
         )
     baseline = read_baseline(verb.baseline) if verb.baseline else None
     config = load_config(verb.config, verb.set)
+    if device == "cuda":
+        required_gpu()
+        config = with_device(config, device)
     sequence, mapper = open_sequence(verb.source), actor_parameters(config).mapper
     with tempfile.TemporaryDirectory() as temporary:
         runs = (verb.runs or Path(temporary)).expanduser()

@@ -33,6 +33,9 @@ COLUMNS["color"] = (11, 14)
 # of the CPU, are below a fifth of each limit.
 TOLERANCE = {"loss": 1e-5, "weights": 1e-6, "exposure": 1e-6, "moments": 2e-5, "pose": 1e-5}
 TOLERANCE["step"] = 2e-6
+# Largest fraction of the Gaussians that rounding makes visible on one of the devices alone. None of
+# the self-test is.
+MAX_BORDERLINE = 1e-3
 # A derivative below this fraction of the largest one in its column may have either sign, and the
 # first step of Adam depends on the sign alone. Its step is not compared.
 CLEAR_RATIO = 1e-2
@@ -40,7 +43,7 @@ CLEAR_RATIO = 1e-2
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Outcome:
-    """Results of one iteration as arrays by name."""
+    """Results of one iteration as arrays by name; rows have the order of the map."""
 
     values: dict[str, np.ndarray]
 
@@ -64,12 +67,12 @@ def run_self_test(arrays: Arrays, repeats: int = REPEATS) -> None:
     """
     scene = _scene()
     for is_half in (False, True):
-        wanted = _iterate(CpuBackend(ADAM, WEIGHTS, LIMITS), *scene, is_half)
+        wanted = iterate(CpuBackend(ADAM, WEIGHTS, LIMITS), *scene, is_half)
         first: Outcome | None = None
         for _ in range(repeats):
-            got = _iterate(GpuBackend(arrays, ADAM, WEIGHTS, LIMITS), *scene, is_half)
+            got = iterate(GpuBackend(arrays, ADAM, WEIGHTS, LIMITS), *scene, is_half)
             if first is None:
-                _require_equal(got, wanted)
+                require_equal(got, wanted)
             elif not got.same_bits(first):
                 raise DeviceError("the results of the self-test differ between two repetitions.")
             first = first or got
@@ -97,9 +100,10 @@ def _scene() -> tuple[np.ndarray, TrainingView]:
     return rows, TrainingView(0, camera, color, depth_m, np.eye(4), mask=mask)
 
 
-def _iterate(
-    backend: OptimizerBackend, rows: np.ndarray, view: TrainingView, is_half: bool
+def iterate(
+    backend: OptimizerBackend, rows: np.ndarray, view: TrainingView, is_half: bool = False
 ) -> Outcome:
+    """Run one iteration of a new backend on Gaussians [N, 16], and return its results."""
     gaussians = GaussianMap(len(rows))
     gaussians.add(rows, 0)
     backend.begin(gaussians)
@@ -107,13 +111,13 @@ def _iterate(
     exposure = backend.estimate_exposure()
     loss, visible = backend.descend(exposure or Exposure(), rate=1.0)
     backend.end()
-    state = backend.snapshot()
+    state, weights = backend.snapshot(), np.zeros(len(rows), np.float32)
+    weights[visible.indices] = visible.weights
     matrix = np.zeros((2, 3)) if exposure is None else exposure.matrix
     return Outcome(
         {
             "loss": np.array([loss.total, loss.l1, loss.d_ssim, loss.depth_m]),
-            "visible": np.array(visible.indices),
-            "weights": np.array(visible.weights),
+            "weights": weights,
             "pose": np.array(visible.xi),
             "exposure": matrix,
             "moments": state["mean"],
@@ -124,21 +128,20 @@ def _iterate(
     )
 
 
-def _require_equal(got: Outcome, wanted: Outcome) -> None:
+def require_equal(got: Outcome, wanted: Outcome) -> None:
     """Check the results of a GPU.
 
     Raises:
         DeviceError: They differ from those of the CPU.
     """
-    for name in ("visible", "steps"):
-        if not np.array_equal(got.values[name], wanted.values[name]):
-            raise DeviceError(f"the self-test has other values of {name} than the CPU.")
+    changed = np.mean(got.values["steps"] != wanted.values["steps"])
+    if changed > MAX_BORDERLINE:
+        raise DeviceError(f"{changed:.1%} of the Gaussians are visible on one device alone.")
     for name, difference in differences(got, wanted).items():
         limit = TOLERANCE[name.partition(" ")[0]]
         if not difference <= limit:  # NaN is above every limit.
             raise DeviceError(
-                f"in the self-test, {name} differs by {difference:.1e} from the CPU, at most "
-                f"{limit:.0e} is allowed."
+                f"{name} differs by {difference:.1e} from the CPU, at most {limit:.0e} is allowed."
             )
 
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import process_time
+from time import perf_counter, process_time
 from typing import Any
 
 import msgspec
@@ -18,7 +18,7 @@ import numpy as np
 
 from ldo_service.config import Config, checked
 from ldo_service.conversions.frames import frame_from_message, mask_from_array
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, DeviceError
 from ldo_service.evaluation.finished_run import Exposures, FinishedRun, PosedMap
 from ldo_service.evaluation.views import view_of
 from ldo_service.gaussians.map_builder import MapBuilder
@@ -73,22 +73,26 @@ class MapMeasurement(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class TimedMapBuilder(MapBuilder):
-    """Map builder that adds up the CPU time of each stage, on one thread.
+    """Map builder that adds up the time of each stage, on one thread.
+
+    On a GPU, it measures wall time, because the host waits for the GPU at the end of a plan.
+    Otherwise, it measures CPU time.
 
     Attributes:
-        times_s: CPU time by stage, seconds.
+        times_s: Time by stage, seconds.
     """
 
     def __init__(self, config: MapBuilderConfig) -> None:
         super().__init__(config)
         self.times_s: defaultdict[str, float] = defaultdict(float)
+        self._clock = perf_counter if self.fitting.device.device == "cuda" else process_time
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
-        """Add the CPU time of a `with` block to a stage."""
-        start = process_time()
+        """Add the time of a `with` block to a stage."""
+        start = self._clock()
         yield
-        self.times_s[stage] += process_time() - start
+        self.times_s[stage] += self._clock() - start
 
     def render_from(self, *args: Any, **kwargs: Any) -> Rendering:
         with self.timed("first rendering"):
@@ -107,6 +111,16 @@ class TimedMapBuilder(MapBuilder):
         spent = dict(self.times_s)
         spent["other"] = spent["all"] - sum(spent.get(stage, 0.0) for stage in STAGES)
         return {stage: 1000 * spent.get(stage, 0.0) / keyframes for stage in (*STAGES, "all")}
+
+
+def require_device(builder: MapBuilder) -> None:
+    """Check that the CPU has not replaced a GPU during a measurement.
+
+    Raises:
+        DeviceError: The GPU is missing or has failed.
+    """
+    if builder.fitting.device.has_failed:
+        raise DeviceError(f"the measurement is void: {builder.fitting.device.reason}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,6 +194,7 @@ class TrackedSource:
 
         Raises:
             ConfigError: No keyframe was recorded.
+            DeviceError: A GPU was asked for, and it failed.
         """
         builder, stamps = TimedMapBuilder(config), dict[int, int]()
         for message in self.keyframes():
@@ -195,6 +210,7 @@ class TrackedSource:
                 f"{self.sequence.name}: no keyframe was mapped in {len(self.run.frames)} frames. "
                 "Use more frames, or a source that the tracker can follow."
             )
+        require_device(builder)
         measured = MapMeasurement(
             source=self.sequence.name,
             frames=len(self.run.frames),
@@ -210,6 +226,7 @@ class TrackedSource:
             return measured
         with builder.timed("refinement"):
             builder.refine(refine_iterations, REFINEMENT_RATES)
+        require_device(builder)
         return msgspec.structs.replace(
             measured,
             refinement_cpu_s=builder.times_s["refinement"],

@@ -57,6 +57,10 @@ class Arrays(Protocol):
     def starts(self, ascending: Any, n: int) -> Any:
         """Return the index of the first value >= k in an ascending array for k = 0 .. n, int32."""
 
+    def peak_bytes(self) -> int:
+        """Return the largest memory that arrays took on a GPU so far, bytes."""
+        ...
+
 
 def checked_total(total: int) -> int:
     """Return the number of pairs of a Gaussian and a tile, if it fits into int32.
@@ -157,6 +161,9 @@ class HostArrays:
     def starts(self, ascending: HostArray, n: int) -> HostArray:
         return HostArray(np.searchsorted(ascending.values, np.arange(n + 1)).astype(np.int32))
 
+    def peak_bytes(self) -> int:
+        return 0
+
 
 class TorchArrays:
     """Arrays in torch, on a GPU or on a CPU.
@@ -212,6 +219,9 @@ class TorchArrays:
     def starts(self, ascending: Any, n: int) -> Any:
         edges = self._torch.arange(n + 1, dtype=ascending.dtype, device=self._device)
         return self._torch.searchsorted(ascending, edges, out_int32=True)
+
+    def peak_bytes(self) -> int:
+        return int(self._torch.cuda.max_memory_allocated())
 
     def _dtype(self, dtype: type) -> Any:
         return getattr(self._torch, np.dtype(dtype).name)

@@ -1,0 +1,104 @@
+"""Times of an optimizer iteration on a GPU beside the CPU, after a comparison of the results."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from ldo_service.errors import DeviceError
+from ldo_service.gaussians import Exposure, GaussianMap, LossWeights, TrainingView
+from ldo_service.gaussians.adam import AdamConfig
+from ldo_service.gaussians.gpu_backend import GpuBackend
+from ldo_service.gaussians.gpu_self_test import iterate, require_equal, run_self_test
+from ldo_service.gaussians.optimizer_backend import CpuBackend, OptimizerBackend, ShapeLimits
+from ldo_service.geometry import Camera, se3
+from ldo_service.kernels.gpu.arrays import Arrays
+
+from .iteration import Steps, medians_ms, noise_frame, walls
+
+ADAM, WEIGHTS = AdamConfig(), LossWeights(l1=0.8, d_ssim=0.2, depth=1.0)
+LIMITS = ShapeLimits(needle_weight=0.01, max_needle_ratio=4.0, max_sigma_px=20.0)
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceTimes:
+    """Median times by stage in milliseconds, and the peak memory of the GPU.
+
+    Attributes:
+        cpu_ms: Times on the CPU.
+        gpu_ms: Times on the GPU. The host waits for the GPU at the end of each stage.
+        gpu_mb: Largest memory that arrays took on the GPU, MB; 0 in the interpreter of Triton.
+    """
+
+    cpu_ms: dict[str, float]
+    gpu_ms: dict[str, float]
+    gpu_mb: float
+
+
+def device_times(
+    arrays: Arrays,
+    n: int,
+    camera: Camera,
+    repeats: int,
+    *,
+    threads: int = 1,
+    self_test_repeats: int = 20,
+    clock: Callable[[], float] = time.perf_counter,
+) -> DeviceTimes:
+    """Measure an iteration on both devices, if their results agree.
+
+    Args:
+        arrays: Arrays of the GPU.
+        n: Number of Gaussians in front of the camera.
+        camera: Camera of the image.
+        repeats: Iterations; the times are medians over them.
+        threads: Threads of the CPU.
+        self_test_repeats: Repetitions of the self-test.
+        clock: Clock in seconds.
+
+    Raises:
+        DeviceError: The GPU fails, or its results differ from those of the CPU.
+    """
+    run_self_test(arrays, self_test_repeats)
+    rows, (color, depth_m) = walls(n, camera), noise_frame(camera)
+    view = TrainingView(0, camera, color, depth_m, se3.exp([0.0] * 6))
+    makers = (
+        lambda: CpuBackend(ADAM, WEIGHTS, LIMITS, threads=threads),
+        lambda: GpuBackend(arrays, ADAM, WEIGHTS, LIMITS),
+    )
+    try:
+        wanted, got = (iterate(make(), rows, view) for make in makers)
+        require_equal(got, wanted)
+    except DeviceError as error:
+        raise DeviceError(
+            f"at {camera.width}x{camera.height} pixels with {n} Gaussians, the results are wrong, "
+            f"so no times are measured: {error}"
+        ) from error
+    steps = []
+    for make in makers:
+        gaussians, backend = GaussianMap(n), make()
+        gaussians.add(rows, 0)
+        backend.begin(gaussians)
+        steps.append(stages(backend, view))
+    cpu_ms, gpu_ms = (with_sum(times) for times in medians_ms(steps, repeats, clock))
+    return DeviceTimes(cpu_ms, gpu_ms, arrays.peak_bytes() / 1e6)
+
+
+def stages(backend: OptimizerBackend, view: TrainingView) -> Steps:
+    """Return the stages of an iteration as functions by name.
+
+    Each stage ends with a download, so that its time includes all work of the GPU.
+    """
+
+    def rendering() -> None:
+        backend.render(view, is_half=False)
+        backend.estimate_exposure()
+
+    def descent() -> None:
+        backend.descend(Exposure(), rate=0.1)
+
+    return {"rendering and exposure": rendering, "loss and step": descent}
+
+
+def with_sum(times_ms: dict[str, float]) -> dict[str, float]:
+    """Return times by stage, with their sum as the time of the iteration."""
+    return {**times_ms, "iteration": sum(times_ms.values())}

@@ -1,0 +1,74 @@
+"""Benchmarks of a GPU, with the interpreter of Triton as the GPU."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from ldo_service.errors import DeviceError
+from ldo_service.evaluation import device_iteration
+from ldo_service.evaluation.iteration import bench_camera
+from ldo_service.kernels.gpu.device import Gpu
+from tests.bench import bench_gpu
+from tests.commands.test_cli import ldo
+from tests.kernels.gpu.scenes import ARRAYS, plane_rendering
+
+GPU = Gpu("interpreter", {"triton": "3.7.1"}, ARRAYS)
+SMALL = ("bench", "render", "--device", "cuda", "--gaussians", "30", "--size", "16x16")
+
+
+@pytest.fixture(autouse=True)
+def _interpreter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Use the interpreter as the GPU, without the self-test, which takes half a minute."""
+    for name in ("ldo_service.commands.bench.find_gpu", "tests.bench.bench_gpu.required_gpu"):
+        monkeypatch.setattr(name, lambda: GPU)
+    monkeypatch.setattr(device_iteration, "run_self_test", lambda *_: None)
+
+
+def test_times_of_both_devices_are_measured(capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = ldo(capsys, *SMALL, "--repeats", "1", "--json")
+    assert code == 0
+    facts = json.loads(out)
+    assert facts["gpu"] == "interpreter"
+    for times_ms in (facts["cpu_ms"], facts["gpu_ms"]):
+        assert set(times_ms) == {"rendering and exposure", "loss and step", "iteration"}
+        assert all(time_ms > 0 for time_ms in times_ms.values())
+    assert facts["gpu_ms"]["iteration"] > facts["cpu_ms"]["iteration"]
+
+
+def test_wrong_results_are_not_timed(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plane_rendering, "LOW_PASS", np.float32(0.301))
+    monkeypatch.setattr(device_iteration, "medians_ms", lambda *_: pytest.fail("it was timed"))
+    code, _, err = ldo(capsys, *SMALL)
+    assert code == 1
+    assert "at 16x16 pixels with 30 Gaussians, the results are wrong, so no times are" in err
+
+
+def test_gpu_that_fails_the_self_test_is_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise DeviceError("the loss differs.")
+
+    monkeypatch.setattr(device_iteration, "run_self_test", fail)
+    with pytest.raises(DeviceError, match="the loss differs"):
+        device_iteration.device_times(ARRAYS, 30, bench_camera(16, 16), 1)
+
+
+def test_program_prints_the_stages(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench_gpu, "SIZES", ((16, 16, 20),))
+    monkeypatch.setattr(bench_gpu, "REPEATS", 1)
+    bench_gpu.report_iterations()
+    out = capsys.readouterr().out
+    assert "interpreter triton 3.7.1" in out
+    assert "16x16, 20 Gaussians" in out
+    assert "  iteration: CPU" in out
+
+
+def test_equal_time_gives_the_saved_time_to_the_iterations() -> None:
+    cpu = SimpleNamespace(cpu_ms={"all": 500.0, "iterations": 400.0})
+    gpu = SimpleNamespace(cpu_ms={"all": 140.0, "iterations": 40.0}, effort=12)
+    assert bench_gpu.equal_time_effort(cpu, gpu) == 120  # type: ignore[arg-type]
