@@ -289,3 +289,41 @@ def test_dockerfile_uses_existing_stages_and_files() -> None:
     ignore_lines = (DEPLOY / "Dockerfile.dockerignore").read_text().splitlines()
     for name in (line[1:] for line in ignore_lines if line.startswith("!")):
         assert (DEPLOY.parent / name).exists()
+
+
+def test_image_for_a_gpu_extends_the_image_for_the_cpu() -> None:
+    text, base = (DEPLOY / "Dockerfile.cuda").read_text(), (DEPLOY / "Dockerfile").read_text()
+    image = read_documents("compose.yaml")[0]["x-ldo"]["image"]
+    assert f"ARG BASE={image}\nFROM ${{BASE}}" in text
+    assert "COPY" not in text, "the build context is empty"
+    assert set(re.findall(r"^USER (\w+)$", text, re.M)) == {"root", "ldo"}
+    assert text.index("USER root") < text.index("RUN") < text.index("USER ldo")
+    assert "useradd --uid 10001 --create-home ldo" in base
+    (extra,) = re.findall(r'"ldo-slam\[(\w+)\]"', text)
+    assert extra in project()["optional-dependencies"]
+    command = json.loads(text[text.index("CMD ") + 4 :])
+    assert command[:3] == json.loads(base[base.index("CMD ") + 4 :].splitlines()[0])
+    assert command[3:] == ["--device", "auto"]
+
+
+def test_service_on_a_gpu_differs_from_that_on_the_cpu_by_its_device() -> None:
+    (base,), (gpu,) = read_documents("compose.yaml"), read_documents("compose.cuda.yaml")
+    (name,) = gpu["services"]
+    service, ours = base["services"][name], gpu["services"][name]
+    assert ours["command"] == [*service["command"], "--device=auto"]
+    assert (DEPLOY / ours["build"]["context"] / ours["build"]["dockerfile"]).is_file()
+    volume, folder = ours["volumes"][0].split(":")
+    assert volume in gpu["volumes"]
+    assert f"TRITON_CACHE_DIR={folder}" in (DEPLOY / "Dockerfile.cuda").read_text()
+
+
+def test_only_the_extra_for_a_gpu_needs_torch() -> None:
+    found = project()
+    assert found["optional-dependencies"]["cuda"] == ["torch>=2.13,<2.14"]
+    others = [extra for name, extra in found["optional-dependencies"].items() if name != "cuda"]
+    for requirement in (*found["dependencies"], *(r for extra in others for r in extra)):
+        assert not requirement.startswith(("torch", "triton", "nvidia"))
+
+
+def project() -> dict:
+    return tomllib.loads((DEPLOY.parent / "pyproject.toml").read_text())["project"]
