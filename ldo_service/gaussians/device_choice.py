@@ -79,7 +79,7 @@ def choose_backend(
         if choice.has_failed:
             log.warning("mapper: no GPU can be used, so the map is fitted on the CPU: %s", error)
         return backend, choice
-    # These modules import Triton, which is optional.
+    # Both modules import Triton, which is optional.
     from .gpu_backend import GpuBackend
     from .gpu_self_test import run_self_test
 

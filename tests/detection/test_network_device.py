@@ -16,7 +16,7 @@ IMAGE = squares_image([("red", 16, 48, 16), ("blue", 112, 80, 16), ("red", 64, 0
 
 
 class GpuSession:
-    """Session of onnxruntime on the CPU that claims to run on a GPU, and fails if told to.
+    """Session of onnxruntime on the CPU that claims to run on a GPU, and can fail.
 
     Attributes:
         failure: Error of the next inference; None for none.

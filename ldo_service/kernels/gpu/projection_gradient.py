@@ -92,6 +92,113 @@ def sums_of_pairs(sums, first, count, BLOCK: tl.constexpr):
 
 
 @triton.jit
+def covariance_gradient(V, Vx, Vy, Vxx, Vxy, Vyy, covariance, box):
+    """Return the derivatives by the image position (u, v) and by the image covariance.
+
+    Args:
+        V: Sum of v = dL/d(ln alpha) over the pixels.
+        Vx: Sum of v d_x over the pixels, where d is the offset of a pixel from the splat.
+        Vy: Sum of v d_y.
+        Vxx: Sum of v d_x d_x.
+        Vxy: Sum of v d_x d_y.
+        Vyy: Sum of v d_y d_y.
+        covariance: Entries (uu, uv, vv) of the image covariance.
+        box: Variance of the box filter of binning, px^2; 0 without binning.
+
+    Returns:
+        Derivatives by u and v, and twice those by the entries uu, uv and vv.
+    """
+    # K is the inverse of the image covariance S. From ln alpha = ln o - d' K d / 2 follow
+    # dL/dmean = K sum(v d) and 2 dL/dS = K sum(v d d') K.
+    uu, uv, vv = covariance
+    inverse = tl.div_rn(1.0, uu * vv - uv * uv)
+    Kuu, Kuv, Kvv = vv * inverse, 0.0 - uv * inverse, uu * inverse
+    by_u, by_v = Kuu * Vx + Kuv * Vy, Kuv * Vx + Kvv * Vy
+    left_uu, left_uv = Kuu * Vxx + Kuv * Vxy, Kuu * Vxy + Kuv * Vyy
+    left_vu, left_vv = Kuv * Vxx + Kvv * Vxy, Kuv * Vxy + Kvv * Vyy
+    Suu, Suv = left_uu * Kuu + left_uv * Kuv, left_uu * Kuv + left_uv * Kvv
+    Svv = left_vu * Kuv + left_vv * Kvv
+    # Binning adds the term ln(|S - box I| / |S|) / 2 to ln alpha.
+    is_binned = box > 0.0
+    nn, mm = uu - box, vv - box
+    narrow = tl.div_rn(V, nn * mm - uv * uv)
+    Suu = tl.where(is_binned, Suu + mm * narrow - V * Kuu, Suu)
+    Suv = tl.where(is_binned, Suv - uv * narrow - V * Kuv, Suv)
+    Svv = tl.where(is_binned, Svv + nn * narrow - V * Kvv, Svv)
+    return by_u, by_v, (Suu, Suv, Svv)
+
+
+@triton.jit
+def shape_gradient(q, axes, sigmas, jacobian_rows, along, by_covariance):
+    """Return the derivatives by log scales and quaternion, and by the rows of the Jacobian.
+
+    Args:
+        q: Quaternion of any length.
+        axes: Principal axes, as long as their standard deviations.
+        sigmas: Standard deviations along the axes.
+        jacobian_rows: Rows du and dv of the Jacobian, in the map frame.
+        along: Components of these rows along the axes.
+        by_covariance: Twice the derivatives by the entries uu, uv and vv of the image covariance.
+
+    Returns:
+        Derivatives by the three log scales, the quaternion, du and dv.
+    """
+    # The covariance is the low pass plus the sum over axes a of (du.a, dv.a) (du.a, dv.a)'.
+    a0, a1, a2 = axes
+    du, dv = jacobian_rows
+    along_u, along_v = along
+    Suu, Suv, Svv = by_covariance
+    m0 = Suu * along_u[0] + Suv * along_v[0]
+    m1 = Suu * along_u[1] + Suv * along_v[1]
+    m2 = Suu * along_u[2] + Suv * along_v[2]
+    n0 = Suv * along_u[0] + Svv * along_v[0]
+    n1 = Suv * along_u[1] + Svv * along_v[1]
+    n2 = Suv * along_u[2] + Svv * along_v[2]
+    zero = tl.zeros_like(Suu)
+    none = (zero, zero, zero)
+    by_du = add_scaled(add_scaled(add_scaled(none, a0, m0), a1, m1), a2, m2)
+    by_dv = add_scaled(add_scaled(add_scaled(none, a0, n0), a1, n1), a2, n2)
+    g0 = add_scaled(add_scaled(none, du, m0 * sigmas[0]), dv, n0 * sigmas[0])
+    g1 = add_scaled(add_scaled(none, du, m1 * sigmas[1]), dv, n1 * sigmas[1])
+    g2 = add_scaled(add_scaled(none, du, m2 * sigmas[2]), dv, n2 * sigmas[2])
+    by_scale = (
+        m0 * along_u[0] + n0 * along_v[0],
+        m1 * along_u[1] + n1 * along_v[1],
+        m2 * along_u[2] + n2 * along_v[2],
+    )
+    return by_scale, quaternion_gradient(q, g0, g1, g2), by_du, by_dv
+
+
+@triton.jit
+def point_gradient(p, inverse_z, slopes, limits, perspective, by_uv, row_u, row_v, depth):
+    """Return the derivative by the point in the camera frame.
+
+    Args:
+        p: Point in the camera frame.
+        inverse_z: 1 / z of the point.
+        slopes: x / z and y / z of the point.
+        limits: Slopes (x min, x max, y min, y max) up to which the Jacobian follows the point.
+        perspective: Entries (ju, jv, ku, kv) of the derivative of the perspective.
+        by_uv: Derivatives by the image position.
+        row_u: Derivative by the row of u of the Jacobian, in the camera frame.
+        row_v: Derivative by the row of v.
+        depth: Derivative by the depth.
+    """
+    ju, jv, ku, kv = perspective
+    by_u, by_v = by_uv
+    x, y = slopes
+    moves_u = tl.where((x >= limits[0]) & (x <= limits[1]), 1.0, 0.0)
+    moves_v = tl.where((y >= limits[2]) & (y <= limits[3]), 1.0, 0.0)
+    pull = by_u * ju * p[0] + by_v * jv * p[1] + ju * row_u[0] + jv * row_v[1]
+    pull = pull - (moves_u + 1.0) * ku * row_u[2] - (moves_v + 1.0) * kv * row_v[2]
+    return (
+        ju * (by_u - moves_u * inverse_z * row_u[2]),
+        jv * (by_v - moves_v * inverse_z * row_v[2]),
+        depth - inverse_z * pull,
+    )
+
+
+@triton.jit
 def store_pose(by_pose, p, g, perspective, row_u, row_v, is_live):
     """Store the derivatives with respect to the pose, summed over the Gaussians of the program.
 
@@ -239,45 +346,17 @@ def project_backward(
     R0, R1, R2, t, lens, limits, filters = camera_of(view, width, height)
     p = to_camera(mean, R0, R1, R2, t)
     du, dv, inverse_z, x, y, perspective = jacobian(p, R0, R1, R2, lens, limits)
-    ju, jv, ku, kv = perspective
     sigmas = exp(scale[0]), exp(scale[1]), exp(scale[2])
     a0, a1, a2 = principal_axes(q, sigmas)
     along_u = (dot(du, a0), dot(du, a1), dot(du, a2))
     along_v = (dot(dv, a0), dot(dv, a1), dot(dv, a2))
     low_pass, box = filters
-    uu, uv, vv = image_covariance(along_u, along_v, low_pass)
+    covariance = image_covariance(along_u, along_v, low_pass)
+    by_u, by_v, by_covariance = covariance_gradient(V, Vx, Vy, Vxx, Vxy, Vyy, covariance, box)
 
-    # K is the inverse of the image covariance S. From ln alpha = ln o - d' K d / 2 follow
-    # dL/dmean = K sum(v d) and 2 dL/dS = K sum(v d d') K.
-    inverse = tl.div_rn(1.0, uu * vv - uv * uv)
-    Kuu, Kuv, Kvv = vv * inverse, 0.0 - uv * inverse, uu * inverse
-    by_u, by_v = Kuu * Vx + Kuv * Vy, Kuv * Vx + Kvv * Vy
-    left_uu, left_uv = Kuu * Vxx + Kuv * Vxy, Kuu * Vxy + Kuv * Vyy
-    left_vu, left_vv = Kuv * Vxx + Kvv * Vxy, Kuv * Vxy + Kvv * Vyy
-    Suu, Suv = left_uu * Kuu + left_uv * Kuv, left_uu * Kuv + left_uv * Kvv
-    Svv = left_vu * Kuv + left_vv * Kvv
-    # Binning adds the term ln(|S - box I| / |S|) / 2 to ln alpha.
-    is_binned = box > 0.0
-    nn, mm = uu - box, vv - box
-    narrow = tl.div_rn(V, nn * mm - uv * uv)
-    Suu = tl.where(is_binned, Suu + mm * narrow - V * Kuu, Suu)
-    Suv = tl.where(is_binned, Suv - uv * narrow - V * Kuv, Suv)
-    Svv = tl.where(is_binned, Svv + nn * narrow - V * Kvv, Svv)
-
-    # S is the low pass plus the sum over axes a of (du.a, dv.a) (du.a, dv.a)'.
-    m0 = Suu * along_u[0] + Suv * along_v[0]
-    m1 = Suu * along_u[1] + Suv * along_v[1]
-    m2 = Suu * along_u[2] + Suv * along_v[2]
-    n0 = Suv * along_u[0] + Svv * along_v[0]
-    n1 = Suv * along_u[1] + Svv * along_v[1]
-    n2 = Suv * along_u[2] + Svv * along_v[2]
-    none = (zero, zero, zero)
-    by_du = add_scaled(add_scaled(add_scaled(none, a0, m0), a1, m1), a2, m2)
-    by_dv = add_scaled(add_scaled(add_scaled(none, a0, n0), a1, n1), a2, n2)
-    g0 = add_scaled(add_scaled(none, du, m0 * sigmas[0]), dv, n0 * sigmas[0])
-    g1 = add_scaled(add_scaled(none, du, m1 * sigmas[1]), dv, n1 * sigmas[1])
-    g2 = add_scaled(add_scaled(none, du, m2 * sigmas[2]), dv, n2 * sigmas[2])
-    by_q = quaternion_gradient(q, g0, g1, g2)
+    by_scale, by_q, by_du, by_dv = shape_gradient(
+        q, (a0, a1, a2), sigmas, (du, dv), (along_u, along_v), by_covariance
+    )
     size = width.to(tl.float32) * height.to(tl.float32)
     push = weight * tl.div_rn(needle_weight, size)
     needle = needle_gradient(scale, push, needle_log_ratio)
@@ -285,22 +364,14 @@ def project_backward(
     # The derivative passes the Jacobian and the perspective to the point in the camera frame.
     row_u = (dot(R0, by_du), dot(R1, by_du), dot(R2, by_du))
     row_v = (dot(R0, by_dv), dot(R1, by_dv), dot(R2, by_dv))
-    moves_u = tl.where((x >= limits[0]) & (x <= limits[1]), 1.0, 0.0)
-    moves_v = tl.where((y >= limits[2]) & (y <= limits[3]), 1.0, 0.0)
-    pull = by_u * ju * p[0] + by_v * jv * p[1] + ju * row_u[0] + jv * row_v[1]
-    pull = pull - (moves_u + 1.0) * ku * row_u[2] - (moves_v + 1.0) * kv * row_v[2]
-    g = (
-        ju * (by_u - moves_u * inverse_z * row_u[2]),
-        jv * (by_v - moves_v * inverse_z * row_v[2]),
-        depth - inverse_z * pull,
-    )
+    g = point_gradient(p, inverse_z, (x, y), limits, perspective, (by_u, by_v), row_u, row_v, depth)
     gradient = (
         g[0] * R0[0] + g[1] * R1[0] + g[2] * R2[0],
         g[0] * R0[1] + g[1] * R1[1] + g[2] * R2[1],
         g[0] * R0[2] + g[1] * R1[2] + g[2] * R2[2],
-        m0 * along_u[0] + n0 * along_v[0] + needle[0],
-        m1 * along_u[1] + n1 * along_v[1] + needle[1],
-        m2 * along_u[2] + n2 * along_v[2] + needle[2],
+        by_scale[0] + needle[0],
+        by_scale[1] + needle[1],
+        by_scale[2] + needle[2],
         by_q[0],
         by_q[1],
         by_q[2],
