@@ -4,13 +4,15 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from ldo_service.errors import DeviceError
 from ldo_service.gaussians import Exposure, GaussianMap, LossWeights, TrainingView
 from ldo_service.gaussians.adam import AdamConfig
 from ldo_service.gaussians.gpu_backend import GpuBackend
 from ldo_service.gaussians.gpu_self_test import iterate, require_equal, run_self_test
 from ldo_service.gaussians.optimizer_backend import CpuBackend, OptimizerBackend, ShapeLimits
-from ldo_service.geometry import Camera, se3
+from ldo_service.geometry import Camera
 from ldo_service.kernels.gpu.arrays import Arrays
 
 from .iteration import Steps, medians_ms, noise_frame, walls
@@ -60,7 +62,7 @@ def device_times(
     """
     run_self_test(arrays, self_test_repeats)
     rows, (color, depth_m) = walls(n, camera), noise_frame(camera)
-    view = TrainingView(0, camera, color, depth_m, se3.exp([0.0] * 6))
+    view = TrainingView(0, camera, color, depth_m, np.eye(4))
     makers = (
         lambda: CpuBackend(ADAM, WEIGHTS, LIMITS, threads=threads),
         lambda: GpuBackend(arrays, ADAM, WEIGHTS, LIMITS),

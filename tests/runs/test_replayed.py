@@ -17,7 +17,7 @@ from ldo_service.actors.topology import GRAPH
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError, DataError, ReplayDiverged
 from ldo_service.recordings import mcap_file
-from ldo_service.runs.replayed import open_recording
+from ldo_service.runs.replayed import _caveats, open_recording
 from ldo_service.runtime.journal import StepRecord, checksum
 from ldo_service.schemas import CameraRgbd, decode, encode
 from ldo_service.testing import replay_recording
@@ -135,6 +135,16 @@ def test_replay_with_another_instruction_set_prints_a_note(
     monkeypatch.setattr(kernels, "isa", lambda: "another")
     _, _, err = ldo(capsys, "replay", str(recording), "--actor", "frame_source")
     assert err.count(f"LDO_ISA={recorded_with}") == 1
+
+
+def test_recording_with_another_gpu_has_a_note(monkeypatch: pytest.MonkeyPatch) -> None:
+    gpu = {"gpu": "Some GPU", "triton": "3.7.1"}
+    about = {"gpu": msgspec.json.encode(gpu).decode()}
+    (note,) = _caveats(about)
+    assert note.startswith("recorded with gpu Some GPU, triton 3.7.1, which this machine lacks")
+    monkeypatch.setattr("ldo_service.runs.replayed.gpu_facts", lambda _: gpu)
+    assert not _caveats(about)
+    assert not _caveats({"gpu": "{}"})
 
 
 def test_an_unknown_actor_is_a_bad_argument(recording: Path, capsys) -> None:

@@ -79,6 +79,7 @@ def test_healthy_actor_has_no_findings(actor: ActorStatus) -> None:
             "without the configured network",
         ),
         (status(health(metrics={"inferences_failed": 3.0})), "3 failed inferences"),
+        (status(health(metrics={"device_failed": 1.0})), "computes on the CPU, because the device"),
         (status(health(metrics={"labellers_missing": 1.0})), "without the configured labeller"),
         (
             status(health(metrics={"labeller_failing": 1.0, "labellings_failed": 2.0})),
