@@ -6,7 +6,7 @@ from typing import Literal
 
 from ldo_service.errors import DeviceError
 from ldo_service.kernels import isa
-from ldo_service.kernels.gpu.device import find_gpu
+from ldo_service.kernels.gpu.device import device_errors, find_gpu
 
 from .adam import AdamConfig
 from .loss import LossWeights
@@ -79,17 +79,21 @@ def choose_backend(
         if choice.has_failed:
             log.warning("mapper: no GPU can be used, so the map is fitted on the CPU: %s", error)
         return backend, choice
-    # Both modules import Triton, which is optional.
-    from .gpu_backend import GpuBackend
-    from .gpu_self_test import run_self_test
-
     try:
-        run_self_test(gpu.arrays)
+        with device_errors("self-test"):
+            # Both modules import Triton, which is optional.
+            from .gpu_backend import GpuBackend
+            from .gpu_self_test import run_self_test
+
+            run_self_test(gpu.arrays)
+            on_gpu = GpuBackend(gpu.arrays, adam, weights, limits)
     except DeviceError as error:
         choice = DeviceChoice("cuda", "", gpu.name).failed(error)
-        log.warning("mapper: %s The map is fitted on the CPU.", choice.reason)
+        log.warning(
+            "mapper: %s The map is fitted on the CPU.", choice.reason, exc_info=error.__cause__
+        )
         return backend, choice
     reason = "the GPU passed the self-test."
     choice = DeviceChoice("cuda", reason, gpu.name, gpu.versions)
     log.info("mapper: the map is fitted on %s (experimental): %s", gpu.name, reason)
-    return GpuBackend(gpu.arrays, adam, weights, limits), choice
+    return on_gpu, choice

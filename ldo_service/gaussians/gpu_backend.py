@@ -1,18 +1,17 @@
 """GPU backend of the Gaussian optimizer; it is experimental."""
 
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import log10
 from weakref import ref
 
 import numpy as np
 
-from ldo_service.errors import DeviceError
 from ldo_service.geometry import se3
 from ldo_service.kernels.gpu import descent, frame_loss, plane_rendering
 from ldo_service.kernels.gpu.arrays import Arrays
+from ldo_service.kernels.gpu.device import device_errors
 
 from .adam import Adam, AdamConfig
 from .exposure import Exposure, ImageBlocks, block_side, fit_blocks
@@ -54,28 +53,6 @@ class ResidentFrame:
         return self.color() is view.color and (
             view.mask is None if self.mask is None else mask is view.mask
         )
-
-
-@contextmanager
-def device_errors(what: str) -> Iterator[None]:
-    """Convert errors of the device in a `with` block to DeviceError.
-
-    torch, Triton and the driver raise errors of several classes, without a common base class.
-
-    Args:
-        what: What the block does, for the error text.
-
-    Raises:
-        DeviceError: The block raised an error.
-    """
-    try:
-        yield
-    except Exception as error:
-        line = (str(error).strip().splitlines() or [""])[0].rstrip(".")
-        raise DeviceError(
-            f"the {what} failed with {type(error).__name__}: {line}. If memory is short, reduce "
-            "mapper.offload.max_resident_gaussians."
-        ) from error
 
 
 class GpuBackend:

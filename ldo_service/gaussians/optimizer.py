@@ -1,7 +1,8 @@
 """Optimization of the map against keyframes: Gaussians, exposures and, optionally, poses."""
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from math import inf
 
@@ -218,6 +219,7 @@ class GaussianOptimizer:
             "mapper: %s The CPU fits the map from now on, and no keyframe is lost. Restart the "
             "service to use the GPU again.",
             self.device.reason,
+            exc_info=error.__cause__,
         )
 
     def _run(
@@ -237,18 +239,22 @@ class GaussianOptimizer:
         Raises:
             DeviceError: The device failed. The map and the moments of its Gaussians are unchanged.
         """
+        with self._begun(gaussians):
+            return self._iterate(views, plan, rates, fixed, effort, starts_half, observe, is_usable)
+
+    @contextmanager
+    def _begun(self, gaussians: GaussianMap) -> Iterator[None]:
+        """Call `begin` of the backend before a `with` block, and `end` after it."""
         self._backend.begin(gaussians)
         try:
-            losses = self._iterate(
-                views, plan, rates, fixed, effort, starts_half, observe, is_usable
-            )
+            yield
         except DeviceError:
             raise  # The map stays as it was at `begin`.
         except BaseException:
-            self._backend.end()
+            with suppress(DeviceError):  # It would hide the error of the block.
+                self._backend.end()
             raise
         self._backend.end()
-        return losses
 
     def _iterate(
         self,
@@ -298,12 +304,12 @@ class GaussianOptimizer:
             rate: Factor on all learning rates.
             is_fixed: Keep the exposure and the pose of the view constant.
             is_half: Render and compare the view at half resolution.
+
+        Raises:
+            DeviceError: The device failed. The map and the moments of its Gaussians are unchanged.
         """
-        self._backend.begin(gaussians)
-        try:
+        with self._begun(gaussians):
             return self._step(view, rate, is_fixed, is_half)
-        finally:
-            self._backend.end()
 
     def _step(
         self, view: TrainingView, rate: float, is_fixed: bool, is_half: bool

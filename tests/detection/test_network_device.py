@@ -21,10 +21,12 @@ class GpuSession:
     Attributes:
         failure: Error of the next inference; None for none.
         error: Value that is added to the outputs.
+        length: Length of the last axis of the outputs; None for all.
     """
 
     failure: Exception | None = None
     error = 0.0
+    length: int | None = None
 
     def __init__(self, session: Any) -> None:
         self._session = session
@@ -38,7 +40,9 @@ class GpuSession:
     def io_binding(self) -> Any:
         binding = self._session.io_binding()
         copy = binding.copy_outputs_to_cpu
-        binding.copy_outputs_to_cpu = lambda: [output + self.error for output in copy()]
+        binding.copy_outputs_to_cpu = lambda: [
+            (output + self.error)[..., : self.length] for output in copy()
+        ]
         return binding
 
     def run_with_iobinding(self, binding: Any) -> None:
@@ -59,7 +63,7 @@ def sessions(monkeypatch: pytest.MonkeyPatch) -> type[GpuSession]:
 
     monkeypatch.setattr(onnx_network, "providers_of", lambda _: [CUDA, CPU])
     monkeypatch.setattr(onnx_network, "_session", session)
-    monkeypatch.setattr(onnx_network, "MEMORY", {})
+    monkeypatch.setattr(onnx_network, "MEMORY", {CUDA: "cpu"})
     return kind
 
 
@@ -95,6 +99,36 @@ def test_cpu_repeats_an_inference_that_fails(
     assert network.metrics() == {"device_failed": 1, "on_gpu": 0}
     (record,) = caplog.records
     assert "CUDA failure 2: out of memory" in record.getMessage()
+    assert "Traceback" in caplog.text
+
+
+def test_first_outputs_of_another_shape_select_the_cpu(
+    tmp_path: Path, sessions: type[GpuSession], caplog
+) -> None:
+    sessions.length = 10
+    network = detector(tmp_path)
+    assert network.metrics() == {"device_failed": 1, "on_gpu": 0}
+    assert len(boxes_of(network)) == 3
+    (record,) = caplog.records
+    assert "differ from the CPU" in record.getMessage()
+
+
+def test_network_that_a_gpu_cannot_open_runs_on_the_cpu(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog
+) -> None:
+    open_session = onnx_network._session
+
+    def session(path: Path, providers: list[str], threads: int) -> Any:
+        if providers[0] == CUDA:
+            raise RuntimeError("CUDA failure 2: out of memory")
+        return open_session(path, providers, threads)
+
+    monkeypatch.setattr(onnx_network, "providers_of", lambda _: [CUDA, CPU])
+    monkeypatch.setattr(onnx_network, "_session", session)
+    network = detector(tmp_path)
+    assert len(boxes_of(network)) == 3
+    assert network.metrics() == {"device_failed": 1, "on_gpu": 0}
+    assert "CUDA failure 2: out of memory" in caplog.text
 
 
 @pytest.mark.parametrize(("error", "reason"), [(0.5, "differ from the CPU"), (np.nan, "are NaN")])

@@ -39,7 +39,7 @@ class FlakyBackend(CpuBackend):
     def _count(self, call: str) -> None:
         if call == self._failing:
             if self._calls_before == 0:
-                raise DeviceError("out of memory.")
+                raise DeviceError("out of memory.") from RuntimeError("CUDA error 2")
             self._calls_before -= 1
 
     def begin(self, gaussians: GaussianMap) -> None:
@@ -125,6 +125,7 @@ def test_plan_of_a_failed_device_is_repeated_by_the_cpu(
     assert fit.optimizer.threads == 2
     (record,) = caplog.records
     assert "out of memory. The CPU fits the map from now on" in record.getMessage()
+    assert "RuntimeError: CUDA error 2" in caplog.text  # The traceback of the cause.
 
 
 def test_device_without_a_failure_keeps_computing(small_room: Callable, on_cpu: Fit) -> None:
@@ -144,6 +145,39 @@ def test_map_is_unchanged_until_the_end_of_the_plan(small_room: Callable) -> Non
     assert steps == [True, True, True, False]  # The last two iterations are those of the CPU.
 
 
+def test_error_of_the_program_is_not_hidden_by_a_failed_device(small_room: Callable) -> None:
+    gaussians, (frame, T_map_camera) = GaussianMap(), small_room(0)
+    densify(gaussians, frame, T_map_camera, 0)
+    optimizer = GaussianOptimizer(CONFIG, backend=FlakyBackend("end"))
+    views = {0: TrainingView.of(frame, T_map_camera, 0)}
+
+    errors = iter([KeyboardInterrupt])
+
+    def interrupt_once(_: int) -> bool:
+        if error := next(errors, None):
+            raise error
+        return True
+
+    with pytest.raises(KeyboardInterrupt):
+        optimizer.optimize(gaussians, views, [0, 0], is_usable=interrupt_once)
+
+
+def test_failed_single_step_changes_no_map(small_room: Callable) -> None:
+    gaussians, (frame, T_map_camera) = GaussianMap(), small_room(0)
+    densify(gaussians, frame, T_map_camera, 0)
+    before = gaussians.rows.copy()
+
+    class LateFailure(FlakyBackend):
+        def descend(self, exposure: Exposure, *, rate: float) -> tuple[ImageLoss, VisibleGaussians]:
+            super().descend(exposure, rate=rate)
+            raise DeviceError("the download failed.")
+
+    optimizer = GaussianOptimizer(CONFIG, backend=LateFailure())
+    with pytest.raises(DeviceError, match="the download failed"):
+        optimizer.step(gaussians, TrainingView.of(frame, T_map_camera, 0))
+    np.testing.assert_array_equal(gaussians.rows, before)
+
+
 # --- choice at the start --------------------------------------------------------------------------
 def no_gpu() -> Gpu:
     raise DeviceError("there is no GPU.")
@@ -160,6 +194,24 @@ def test_missing_gpu_is_replaced_by_the_cpu(
     assert choice.reason == (
         "service.device=cpu was chosen." if wanted == "cpu" else "there is no GPU."
     )
+
+
+def test_unexpected_error_of_the_self_test_selects_the_cpu(
+    monkeypatch: pytest.MonkeyPatch, caplog
+) -> None:
+    pytest.importorskip("triton", reason="`make gpu-check` installs Triton")
+    from ldo_service.gaussians import gpu_self_test
+
+    def self_test(_: object) -> None:
+        raise TypeError("launch() takes 3 arguments")
+
+    gpu = Gpu("Some GPU", {}, HostArrays())
+    monkeypatch.setattr("ldo_service.gaussians.device_choice.find_gpu", lambda: gpu)
+    monkeypatch.setattr(gpu_self_test, "run_self_test", self_test)
+    backend, choice = choose_backend("auto", CONFIG.adam, CONFIG.loss, CONFIG.limits)
+    assert type(backend) is CpuBackend
+    assert "the self-test failed with TypeError: launch() takes 3 arguments" in choice.reason
+    assert "in self_test" in caplog.text  # The traceback.
 
 
 @pytest.mark.parametrize("error", [None, DeviceError("the loss differs.")])

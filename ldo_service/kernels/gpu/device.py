@@ -1,9 +1,10 @@
 """Search for a GPU that the kernels can use."""
 
 import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import version
 from typing import Any
 
 from ldo_service.errors import DeviceError, install_command
@@ -35,8 +36,37 @@ def find_gpu() -> Gpu:
     Raises:
         DeviceError: There is no GPU, or a library that the kernels need is missing.
     """
-    torch = _library("torch")
-    _library("triton")
+    torch, triton = _library("torch"), _library("triton")
+    with device_errors("search for a GPU"):
+        return _found(torch, triton)
+
+
+@contextmanager
+def device_errors(what: str) -> Iterator[None]:
+    """Convert errors in a `with` block to DeviceError.
+
+    torch, Triton and the driver raise errors of several classes, without a common base class. An
+    error of this program is converted too. Callers therefore log the traceback of the cause.
+
+    Args:
+        what: What the block does, for the error text.
+
+    Raises:
+        DeviceError: The block raised an error.
+    """
+    try:
+        yield
+    except DeviceError:
+        raise
+    except Exception as error:
+        line = (str(error).strip().splitlines() or [""])[0].rstrip(".")
+        raise DeviceError(
+            f"the {what} failed with {type(error).__name__}: {line}. If memory is short, reduce "
+            "mapper.offload.max_resident_gaussians."
+        ) from error
+
+
+def _found(torch: Any, triton: Any) -> Gpu:
     if not torch.cuda.is_available():
         raise DeviceError(
             f"torch {torch.__version__} finds no GPU. Check that `nvidia-smi` lists one, and that "
@@ -52,7 +82,7 @@ def find_gpu() -> Gpu:
         "compute capability": f"{major}.{minor}",
         "cuda": str(torch.version.cuda),
         "torch": str(torch.__version__),
-        "triton": version("triton"),
+        "triton": str(triton.__version__),
         "machine": platform.machine(),
     }
     return Gpu(name, found, TorchArrays("cuda"))

@@ -19,8 +19,7 @@ def torch(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     )
     torch = SimpleNamespace(__version__="2.13.0", version=SimpleNamespace(cuda="12.8"), cuda=cuda)
     monkeypatch.setitem(sys.modules, "torch", torch)
-    monkeypatch.setitem(sys.modules, "triton", SimpleNamespace())
-    monkeypatch.setattr("ldo_service.kernels.gpu.device.version", lambda _: "3.7.1")
+    monkeypatch.setitem(sys.modules, "triton", SimpleNamespace(__version__="3.7.1"))
     return torch
 
 
@@ -46,6 +45,16 @@ def test_old_gpu_is_an_error(torch: SimpleNamespace) -> None:
     torch.cuda.get_device_capability = lambda _: (6, 1)
     with pytest.raises(DeviceError, match=r"capability 6.1, and the kernels need 7.5"):
         find_gpu()
+
+
+def test_error_of_the_driver_is_a_device_error(torch: SimpleNamespace) -> None:
+    def fail(_: int) -> str:
+        raise RuntimeError("CUDA error: unknown error\nCompile with TORCH_USE_CUDA_DSA.")
+
+    torch.cuda.get_device_name = fail
+    with pytest.raises(DeviceError, match=r"search for a GPU failed with RuntimeError: CUDA error"):
+        find_gpu()
+    assert gpu_facts("cuda") == {}
 
 
 @pytest.mark.usefixtures("torch")
