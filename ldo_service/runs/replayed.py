@@ -86,30 +86,34 @@ def _config_of(about: Mapping[str, str]) -> Config:
         ) from error
 
 
-def _versions_of(about: Mapping[str, str]) -> dict[str, str]:
-    """Return the versions of the libraries at the time of the recording, by name.
+def _facts_of(about: Mapping[str, str], kind: str) -> dict[str, str]:
+    """Return facts about the recording machine by name; `kind` is gpu or versions.
 
     Raises:
-        DataError: The versions cannot be read.
+        DataError: The facts cannot be read.
     """
     try:
-        return msgspec.json.decode(about.get("versions", "{}"), type=dict[str, str])
+        return msgspec.json.decode(about.get(kind, "{}"), type=dict[str, str])
     except msgspec.DecodeError as error:
         raise DataError(
-            f"the versions in the recording cannot be read: {error}. Copy the recording again, or "
-            "make a new one."
+            f"the entry {kind} in the recording cannot be read: {error}. Copy the recording again, "
+            "or make a new one."
         ) from error
 
 
 def _gpu_caveat(about: Mapping[str, str]) -> list[str]:
-    """Return a note if this machine has another GPU than that of the recording."""
-    recorded = msgspec.json.decode(about.get("gpu", "{}"), type=dict[str, str])
-    if not recorded or recorded == gpu_facts("cuda"):
+    """Return a note if the replay uses another GPU than the recording, or only one of them does."""
+    recorded = _facts_of(about, "gpu")
+    ours = gpu_facts(_config_of(about).service.device)
+    if recorded == ours:
         return []
-    facts = ", ".join(f"{name} {value}" for name, value in recorded.items())
+    texts = [
+        ", ".join(f"{name} {value}" for name, value in facts.items()) or "the CPU"
+        for facts in (recorded, ours)
+    ]
     return [
-        f"recorded with {facts}, which this machine lacks: the results of the mapper and of "
-        "networks may differ. Replay on an equal GPU with equal versions."
+        f"recorded with {texts[0]}, replayed with {texts[1]}: the results of the mapper and of "
+        "networks may differ. Replay on an equal device with equal versions."
     ]
 
 
@@ -123,7 +127,7 @@ def _caveats(about: Mapping[str, str]) -> list[str]:
         )
     lines += _gpu_caveat(about)
     now = versions()
-    for name, version in _versions_of(about).items():
+    for name, version in _facts_of(about, "versions").items():
         if now.get(name) != version:
             lines.append(
                 f"recorded with {name} {version}, replayed with {now.get(name)}: the results may "

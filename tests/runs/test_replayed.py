@@ -141,10 +141,30 @@ def test_recording_with_another_gpu_has_a_note(monkeypatch: pytest.MonkeyPatch) 
     gpu = {"gpu": "Some GPU", "triton": "3.7.1"}
     about = {"gpu": msgspec.json.encode(gpu).decode()}
     (note,) = _caveats(about)
-    assert note.startswith("recorded with gpu Some GPU, triton 3.7.1, which this machine lacks")
+    assert note.startswith("recorded with gpu Some GPU, triton 3.7.1, replayed with the CPU:")
     monkeypatch.setattr("ldo_service.runs.replayed.gpu_facts", lambda _: gpu)
     assert not _caveats(about)
+
+
+def test_recording_without_a_gpu_has_a_note_if_the_replay_uses_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    facts = {"auto": {"gpu": "Some GPU"}, "cpu": {}}
+    monkeypatch.setattr("ldo_service.runs.replayed.gpu_facts", facts.__getitem__)
+    (note,) = _caveats({"gpu": "{}", "config": "service: {device: auto}"})
+    assert note.startswith("recorded with the CPU, replayed with gpu Some GPU:")
     assert not _caveats({"gpu": "{}"})
+    assert not _caveats({})  # A recording of an earlier version.
+
+
+def test_earlier_recording_with_execution_providers_is_refused_with_the_new_setting() -> None:
+    with pytest.raises(ConfigError, match=r"inference.providers is now service.device"):
+        _caveats({"config": "inference: {providers: [cpu], threads: 1}"})
+
+
+def test_damaged_facts_about_the_gpu_are_a_data_error() -> None:
+    with pytest.raises(DataError, match="the entry gpu in the recording cannot be read"):
+        _caveats({"gpu": "{"})
 
 
 def test_an_unknown_actor_is_a_bad_argument(recording: Path, capsys) -> None:
