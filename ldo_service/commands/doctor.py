@@ -24,6 +24,8 @@ from ldo_service.gaussians.device_choice import choose_backend
 from ldo_service.schemas import Health
 from ldo_service.schemas.topics import HEALTH
 from ldo_service.service.diagnostics import ActorStatus, diagnose, notes
+from ldo_service.service.forecast import forecast
+from ldo_service.service.state_forecast import forecast_of_state
 from ldo_service.transport.endpoint import DEFAULT_ENDPOINT, Endpoint
 from ldo_service.transport.keys import TlsKeys, expiry_warning
 
@@ -62,29 +64,40 @@ EXPERIMENTAL = {
     "cuda": "Mapping on a GPU is experimental until `ldo bench --device cuda` has passed on it"
 }
 REINSTALL = "`.venv/bin/pip install -e .` in the clone of LDO-SLAM installs all libraries."
-LISTEN_S = 1.5  # Three heartbeats.
+# Time for which a running service is observed, seconds: twenty heartbeats, and ten or more
+# keyframes of a moving camera.
+WINDOW_S = 10.0
 Check = Annotated[
-    Literal["service", "calibration"],
+    Literal["service", "calibration", "forecast"],
     tyro.conf.Positional,
     argument(
         metavar="CHECK",
         help="service: this machine and the running service; calibration: the camera of the "
-        "finished run DIR",
+        "finished run DIR; forecast: the growth of the state folder DIR",
     ),
 ]
-Run = Annotated[
+Folder = Annotated[
     Path | None,
     tyro.conf.Positional,
-    argument(metavar="DIR", help="folder of a run, for the check of the calibration"),
+    argument(
+        metavar="DIR", help="folder of a run for calibration, or of a service's state for forecast"
+    ),
 ]
 
 
 def doctor(
     check: Check = "service",
-    run: Run = None,
+    folder: Folder = None,
     robot: Robot = "robot",
     endpoint: EndpointAddress = DEFAULT_ENDPOINT,
     keys: KeysFolder = None,
+    window_s: Annotated[
+        float,
+        argument(
+            metavar="SECONDS",
+            help="time for which a running service is observed; the forecast gets better with it",
+        ),
+    ] = WINDOW_S,
 ) -> None:
     """Check this machine and a running service, or a camera, and print how to fix each problem.
 
@@ -94,28 +107,38 @@ def doctor(
     vignetting, and the times at which rows of color and depth are recorded. A line marked warn
     says how a large value affects the results and how to avoid this.
 
+    For a running service, the last lines are a forecast: what a keyframe takes of memory, disk and
+    time, and the bounds that are reached within 24 hours at this rate. `ldo doctor forecast DIR`
+    prints a forecast for the state folder DIR.
+
       ldo doctor
+      ldo doctor --window-s 60
+      ldo doctor forecast states/robot
       ldo doctor calibration runs/desk
     """
-    if check == "calibration" and run is None:
+    if window_s <= 0:
+        raise ConfigError(f"--window-s {window_s:g} must be positive.")
+    if check == "service":
+        if folder is not None:
+            raise ConfigError(
+                f"the folder {folder} applies only to `ldo doctor calibration {folder}` or `ldo "
+                f"doctor forecast {folder}`. Remove it, or add one of these words."
+            )
+        show(
+            (
+                *(*machine(), *libraries(), *extras(), *devices(), *networks()),
+                *(*certificates(endpoint, keys), *service(robot, endpoint, keys, window_s)),
+            )
+        )
+    elif folder is None:
+        example = {"calibration": "runs/desk", "forecast": "states/robot"}[check]
         raise ConfigError(
-            "`ldo doctor calibration` needs the folder of a run, as in `ldo doctor calibration "
-            "runs/desk`."
+            f"`ldo doctor {check}` needs a folder, as in `ldo doctor {check} {example}`."
         )
-    if check != "calibration" and run is not None:
-        raise ConfigError(
-            f"the folder {run} applies only to `ldo doctor calibration {run}`. Remove it, or add "
-            "the word calibration."
-        )
-    if run is not None:
-        show(camera_findings(run))
-        return
-    show(
-        (
-            *(*machine(), *libraries(), *extras(), *devices(), *networks()),
-            *(*certificates(endpoint, keys), *service(robot, endpoint, keys)),
-        )
-    )
+    elif check == "calibration":
+        show(camera_findings(folder))
+    else:
+        show(Finding("note", line) for line in forecast_of_state(folder).lines())
 
 
 def machine() -> Iterator[Finding]:
@@ -192,10 +215,12 @@ def networks() -> Iterator[Finding]:
             yield Finding("bad", f"network {name}: {error}")
 
 
-def service(robot: str, endpoint: str, keys: Path | None) -> Iterator[Finding]:
-    """Check every actor of the running service, if there is one."""
+def service(
+    robot: str, endpoint: str, keys: Path | None, window_s: float = WINDOW_S
+) -> Iterator[Finding]:
+    """Check every actor of the running service, if there is one, and print a forecast."""
     try:
-        actors = seen(robot, endpoint, keys)
+        actors, heard = seen(robot, endpoint, keys, window_s)
     except ConfigError as error:
         if keys is not None:
             yield Finding("bad", str(error))
@@ -211,6 +236,7 @@ def service(robot: str, endpoint: str, keys: Path | None) -> Iterator[Finding]:
         return
     for actor in actors:
         yield from of_actor(actor)
+    yield from (Finding("note", line) for line in forecast(heard).lines())
 
 
 def certificates(endpoint: str, keys: Path | None) -> Iterator[Finding]:
@@ -231,40 +257,45 @@ def certificates(endpoint: str, keys: Path | None) -> Iterator[Finding]:
             yield Finding("ok", f"{what}: valid until {date.fromtimestamp(until_s)}")
 
 
-def seen(robot: str, endpoint: str, keys: Path | None = None) -> list[ActorStatus]:
-    """Listen to a service for LISTEN_S seconds and return the status of every actor.
+def seen(
+    robot: str, endpoint: str, keys: Path | None = None, window_s: float = WINDOW_S
+) -> tuple[list[ActorStatus], dict[str, list[tuple[float, Health]]]]:
+    """Listen to a service.
 
     Args:
         robot: Name of the robot.
         endpoint: Address of the service's router.
         keys: Folder with TLS keys; None for a service without keys.
+        window_s: Duration, seconds.
+
+    Returns:
+        The status of every actor, and by actor the arrival time in seconds of each heartbeat, and
+        the heartbeat.
 
     Raises:
         ConfigError: No router answers on the endpoint.
     """
-    heard: dict[str, tuple[float, Health]] = {}
+    heard: dict[str, list[tuple[float, Health]]] = {}
     with (
         connect(robot, endpoint, keys) as client,
         client.poller(HEALTH.subscription_key, Health) as inbox,
     ):
-        until_s = time.monotonic() + LISTEN_S
+        until_s = time.monotonic() + window_s
         while time.monotonic() < until_s:
             for health in inbox():
-                heard[health.actor] = (time.monotonic(), health)
+                heard.setdefault(health.actor, []).append((time.monotonic(), health))
             time.sleep(0.05)
         alive, now_s = client.live_actors(), time.monotonic()
     names = [box.name for box in GRAPH]
     names += sorted((set(heard) | alive) - set(names))  # Actors of a later version.
-    return [_seen(name, name in alive, heard.get(name), now_s) for name in names]
-
-
-def _seen(
-    name: str, has_token: bool, last: tuple[float, Health] | None, now_s: float
-) -> ActorStatus:
-    if last is None:
-        return ActorStatus(name, has_token, None, LISTEN_S)
-    heard_at_s, health = last
-    return ActorStatus(name, has_token, health, LISTEN_S, heartbeat_age_s=now_s - heard_at_s)
+    actors = [
+        ActorStatus(name, name in alive, None, window_s)
+        if name not in heard
+        else ActorStatus(name, name in alive, heard[name][-1][1], window_s,
+                         heartbeat_age_s=now_s - heard[name][-1][0])
+        for name in names
+    ]  # fmt: skip
+    return actors, heard
 
 
 def of_actor(actor: ActorStatus) -> Iterator[Finding]:

@@ -106,10 +106,12 @@ class KeyframeStore:
                 self._drop(keyframe)
 
     def metrics(self) -> dict[str, float]:
-        """Return the counters of the store."""
+        """Return the counters and limits of the store."""
         return {
             "keyframes_stored": len(self),
+            "keyframes_stored_max": self.config.max_keyframes,
             "keyframes_disk_mb": sum(self.files.sizes.values()) / 1e6,
+            "keyframes_disk_max_mb": self.config.quota_mb,
             "keyframes_cache_mb": self._cached_bytes() / 1e6,
             "keyframes_read": self._reads,
             "keyframes_forgotten": self._forgotten,

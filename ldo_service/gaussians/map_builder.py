@@ -387,6 +387,7 @@ class MapBuilder:
     def metrics(self) -> dict[str, float]:
         return {
             "gaussians": len(self.gaussians),
+            "gaussians_max": self.config.offload.max_active,  # More are offloaded to disk.
             "gaussians_pruned": self._pruned,
             "iterations": self.fitting.iterations,
             # Chosen keyframes that may see offloaded Gaussians, or whose images are unreadable.

@@ -277,6 +277,7 @@ class OffloadedGaussians:
         return {
             "gaussians_offloaded": len(self),
             "chunks_offloaded": len(self._entries),
+            "gaussians_disk_mb": sum(self.files.sizes.values()) / 1e6,
             "gaussians_offloaded_total": self._slept,
             "gaussians_loaded_total": self._awoken,
             "gaussians_lost_on_disk": self._damaged,

@@ -228,6 +228,8 @@ class RecordingFile:
         self._channels: dict[str, int] = {}
         self._log_ns = 0  # Log time of the last record.
         self._unchecked = 0  # Bytes written since the last check of the limits.
+        self._written = 0  # Bytes written by this object.
+        self._used = recording_bytes(path.parent)  # Size of the folder at the last check, bytes.
         self.is_open = True
 
     def add_entry(self, entry: Entry) -> None:
@@ -259,6 +261,7 @@ class RecordingFile:
         except OSError as error:
             self._give_up(error)
         self._unchecked += len(body)
+        self._written += len(body)
 
     def _channel(self, topic: str, kind: type) -> int:
         if topic not in self._channels:
@@ -276,9 +279,27 @@ class RecordingFile:
             return False
         self._unchecked = 0
         folder = self.path.parent
-        used = recording_bytes(folder)
+        self._used = recording_bytes(folder)
         free = shutil.disk_usage(folder).free
-        return used > self._config.max_gb * 1e9 or free < self._config.min_free_gb * 1e9
+        return self._used > self._config.max_gb * 1e9 or free < self._config.min_free_gb * 1e9
+
+    def metrics(self) -> dict[str, float]:
+        """Return sizes and limits, MB; empty if the file is closed, because it then has no limit.
+
+        `recording_mb` is the size of the folder at the last check, plus the messages that were
+        written to this file since.
+        """
+        if not self.is_open:
+            return {}
+        metrics = {
+            "recording_file_mb": self._written / 1e6,
+            "recording_mb": (self._used + self._unchecked) / 1e6,
+            "recording_max_mb": 1e3 * self._config.max_gb,
+            "recording_min_free_mb": 1e3 * self._config.min_free_gb,
+        }
+        with suppress(OSError):  # The folder was removed.
+            metrics["recording_free_mb"] = shutil.disk_usage(self.path.parent).free / 1e6
+        return metrics
 
     def close(self) -> None:
         """Write the summary and close the file.

@@ -182,6 +182,7 @@ class Recorder(Journal):
             "journal_steps": self._steps,
             "journal_messages_dropped": self._lost_before + self._lost,
             "journal_waiting_mb": self._waiting / 1e6,
+            **self._file.metrics(),
         }
 
     # --- gaps -------------------------------------------------------------------------------------

@@ -1,7 +1,10 @@
 """Checkpoints of a stage: the actor's state and the delivery state, saved in one write."""
 
 import logging
+import os
+import shutil
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from ldo_service.storage.atomic_write import sync_all, with_folders
@@ -35,6 +38,7 @@ class Checkpointer:
     def __init__(self, store: StateStore) -> None:
         self._store, self._ledger = store, DeliveryState()
         self.past = RestoredState()
+        self._name = ""  # Name of the actor.
         self.is_unsaved = False  # True if the last step is not saved.
         self._failed = 0
         self._has_fallen_back = False
@@ -48,6 +52,7 @@ class Checkpointer:
             make: Function that creates a new actor.
         """
         fresh = make()
+        self._name = fresh.name
         self.past = RestoredState.of(self._store.load(fresh.name))
         self._sync_files(fresh.name)
         self._has_fallen_back = self._store.has_fallen_back(fresh.name)
@@ -205,8 +210,16 @@ class Checkpointer:
         return is_first
 
     def metrics(self) -> dict[str, float]:
-        """Return counters of failed saves and damaged states; empty if there were none."""
+        """Return sizes on disk, and counters of failed saves and damaged states, if any.
+
+        `state_mb` is the size of the actor's state and its older generations.
+        """
         metrics: dict[str, float] = {}
+        if isinstance(self._store, FolderStore):
+            with suppress(OSError):  # A failed save says so, if the folder was removed.
+                files = os.scandir(self._store.folder / self._name)
+                metrics["state_mb"] = sum(file.stat().st_size for file in files) / 1e6
+                metrics["disk_free_mb"] = shutil.disk_usage(self._store.folder).free / 1e6
         if self._failed:
             metrics["checkpoint_failing"] = float(self.is_unsaved)
             metrics["checkpoints_failed"] = self._failed

@@ -70,6 +70,11 @@ class Outbox:
         """Size of the messages on disk, or in memory if there is no log, bytes."""
         return self._log.size_bytes if self._log else self._bytes
 
+    @property
+    def max_bytes(self) -> int | None:
+        """Maximum of `size_bytes`; None if there is no maximum."""
+        return self._log.max_bytes if self._log else self._max_bytes
+
     def first(self, end: int) -> int:
         """Return the number of the first message; `end` if there is none.
 

@@ -389,6 +389,7 @@ class Outlet:
             behind=self._consumers.behind(self._seq),
             backlog_mb=1e-6 * self.outbox.size_bytes,
             backlog_dropped=self.outbox.dropped,
+            backlog_max_mb=1e-6 * (self.outbox.max_bytes or 0),
         )
 
     def close(self) -> None:

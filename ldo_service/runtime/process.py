@@ -37,6 +37,15 @@ def resident_mb() -> float:
     return pages * resource.getpagesize() / 1e6
 
 
+def available_memory_mb() -> float | None:
+    """Return the memory that this machine can still give to programs, MB; None if unknown."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:  # Other systems than Linux have no such file.
+        return None
+    return next((int(x.split()[1]) / 1e3 for x in lines if x.startswith("MemAvailable:")), None)
+
+
 def trim_memory() -> None:
     """Return freed memory to the operating system.
 

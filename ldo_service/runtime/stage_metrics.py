@@ -14,7 +14,7 @@ import numpy as np
 from ldo_service.schemas import Health, Message
 
 from ._heartbeat import Heartbeat
-from .process import resident_mb
+from .process import available_memory_mb, resident_mb
 from .supervision_policy import RunningClock
 
 # Consecutive dead letters after which an actor counts as failing: one or two have their cause in
@@ -88,6 +88,9 @@ class StageMetrics:
     def health(self, **of_the_stage: Any) -> Health:
         """Return the health message; `of_the_stage` has the fields that only the stage knows."""
         step_ms = np.array(self.step_ms or [0.0])
+        facts, available_mb = self.facts, available_memory_mb()
+        if available_mb is not None:
+            facts = {**facts, "memory_available_mb": available_mb}
         is_busy = self.started_at_s is not None and self.state == "ready"
         return Health(
             stamp_ns=self.last_stamp_ns,
@@ -103,7 +106,7 @@ class StageMetrics:
             step_ms_p95=float(np.percentile(step_ms, 95)),
             rss_mb=resident_mb(),
             # A metric that is no number must not suppress the heartbeat.
-            metrics={name: value for name, value in self.facts.items() if isfinite(value)},
+            metrics={name: value for name, value in facts.items() if isfinite(value)},
             failing=self.dead_lettered_in_a_row >= FAILING_AFTER,
             quarantined=self.quarantined,
             **of_the_stage,

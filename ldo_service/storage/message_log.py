@@ -73,7 +73,7 @@ class MessageLog:
             max_bytes: Maximum size of the log, bytes.
             syncs: Sync every message to the disk, so that the log survives a power cut too.
         """
-        self._folder, self._epoch, self._max_bytes, self._syncs = folder, epoch, max_bytes, syncs
+        self._folder, self._epoch, self.max_bytes, self._syncs = folder, epoch, max_bytes, syncs
         self._lock = Lock()
         self._segments: list[_Segment] = []
         self._open: _Segment | None = None  # The segment that is being written.
@@ -159,7 +159,7 @@ class MessageLog:
     def _drop_oldest(self) -> None:
         """Delete the oldest segments beyond the maximum size, but never the last one."""
         size = sum(segment.size for segment in self._segments)
-        while size > self._max_bytes and len(self._segments) > 1:
+        while size > self.max_bytes and len(self._segments) > 1:
             oldest = self._segments.pop(0)
             size -= oldest.size
             self.dropped += max(0, oldest.next - max(self._handled, self._first, oldest.first))

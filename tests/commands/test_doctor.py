@@ -3,12 +3,13 @@
 import importlib.util
 import tomllib
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 import pytest
 
 from ldo_service.commands import doctor
-from ldo_service.errors import DeviceError, LdoError
+from ldo_service.errors import ConfigError, DeviceError, LdoError
 from ldo_service.kernels.gpu.arrays import HostArrays
 from ldo_service.kernels.gpu.device import Gpu
 from ldo_service.service.diagnostics import ActorStatus
@@ -56,6 +57,19 @@ def test_dropped_messages_are_named_by_topic() -> None:
     assert ", 59 older graph/correction replaced by newer ones, 0 lost" in finding.text
     (finding,) = doctor.of_actor(ActorStatus("mapper", True, health(), 1.5))
     assert ", 0 dropped, " in finding.text
+
+
+@pytest.mark.parametrize("check", ["calibration", "forecast"])
+def test_check_of_a_folder_without_a_folder_is_an_error(
+    check: Literal["calibration", "forecast"],
+) -> None:
+    with pytest.raises(ConfigError, match=f"`ldo doctor {check}` needs a folder, as in"):
+        doctor.doctor(check)
+
+
+def test_window_must_be_positive() -> None:
+    with pytest.raises(ConfigError, match="--window-s 0 must be positive"):
+        doctor.doctor(window_s=0.0)
 
 
 def test_every_extra_of_the_package_is_checked() -> None:

@@ -18,7 +18,7 @@ def test_doctor_reports_stopped_process_and_missing_frames(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def doctor() -> tuple[int, str]:
-        code, out, _ = ldo(capsys, "doctor", "--endpoint", service.endpoint)
+        code, out, _ = ldo(capsys, "doctor", "--window-s", "1.5", "--endpoint", service.endpoint)
         return code, " ".join(out.split())
 
     with live_service(tmp_path, "--set", "service.heartbeat_timeout_s=60") as service:

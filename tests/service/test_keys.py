@@ -26,7 +26,16 @@ def test_poses_are_received_over_tls_and_roles_are_enforced(tmp_path: Path) -> N
     listen = ("--endpoint", f"tls/0.0.0.0:{port}", "--keys", str(keys / "service"))
     service = subprocess.Popen([*LDO, "serve", *listen, "--state", str(tmp_path / "s")])
     try:
-        doctor = [*LDO, "doctor", "--endpoint", here, "--keys", str(keys / "viewer")]
+        doctor = [
+            *LDO,
+            "doctor",
+            "--window-s",
+            "1.5",
+            "--endpoint",
+            here,
+            "--keys",
+            str(keys / "viewer"),
+        ]
         wait_until(lambda: subprocess.run(doctor, capture_output=True).returncode == 0, 40, "up")
         to_camera = ("--endpoint", here, "--keys", str(keys / "camera"))
         frames = ("synthetic:room", "--rate", "15", "--max-frames", "30")
