@@ -36,6 +36,7 @@ class OutputCount(msgspec.Struct, frozen=True, kw_only=True):
     behind: dict[str, int] = {}
     backlog_mb: float = 0.0  # Size of the backlog on disk, MB.
     backlog_dropped: int = 0  # Messages dropped because the backlog had its maximum size.
+    backlog_max_mb: float = 0.0  # Maximum size of the backlog, MB; 0: no maximum.
 
 
 class Health(Message, frozen=True, kw_only=True):

@@ -1,10 +1,13 @@
 """Checks, pairing and rejection of camera frames."""
 
+from pathlib import Path
+
 import msgspec
 import numpy as np
 import pytest
 
 from ldo_service.actors.frame_source import FrameSource, FrameSourceConfig
+from ldo_service.config import Config
 from ldo_service.conversions.frames import camera_to_message, raw_frame_to_message
 from ldo_service.conversions.poses import pose_to_message
 from ldo_service.datasets import Sequence
@@ -260,6 +263,18 @@ def test_one_stamp_in_the_far_future_does_not_block_later_frames(room: Sequence)
     future = msgspec.structs.replace(message, stamp_ns=10**18)
     frames = [message, future, raw_frame_to_message(room.read(1))]
     assert len([out for frame in frames for out in source.handle(frame)]) == 3
+
+
+def test_documented_largest_image_is_the_one_that_the_tracker_can_receive(
+    room: Sequence, message: CameraRgbd
+) -> None:
+    (frame,) = FrameSource().handle(message)
+    pixels = room[3].depth_m.size
+    bytes_per_pixel = len(encode(frame)) // pixels  # The rest, the header, is below one per pixel.
+    limit_mb = Config().service.max_decoded_message_mb
+    limits = (Path(__file__).parents[2] / "docs" / "limits.md").read_text()
+    assert f"| an image | {limit_mb / bytes_per_pixel:.1f} megapixels with the default" in limits
+    assert f"a frame takes {bytes_per_pixel} bytes per pixel" in limits
 
 
 @pytest.mark.parametrize("far", [1000.0, 1e30, float(np.finfo(np.float32).max)])

@@ -136,6 +136,15 @@ def test_prometheus_scrapes_the_metrics_port_of_the_unit() -> None:
     assert f"LDO_METRICS_PORT={target.rpartition(':')[2]}\n" in unit
 
 
+def test_each_robot_of_a_machine_can_have_ports_of_its_own() -> None:
+    lines = UNIT.read_text().splitlines()
+    (start,) = [line for line in lines if line.startswith("ExecStart=")]
+    assert "--endpoint ${LDO_ENDPOINT} " in start
+    assert "--metrics-port ${LDO_METRICS_PORT}" in start
+    assert re.findall(r":\d+|port \d+", start) == [], "the command fixes no port"
+    assert "EnvironmentFile=-/etc/ldo/%i.env" in lines, "a file of the robot replaces the ports"
+
+
 # --- commands -------------------------------------------------------------------------------------
 def commands() -> Iterator[list[str]]:
     """Yield every command line of `ldo` in deploy/."""

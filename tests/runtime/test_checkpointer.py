@@ -46,6 +46,25 @@ def unsynced_of(state: Path) -> tuple[str, ...]:
     return contents.unsynced
 
 
+def test_files_of_an_actor_are_synced_before_the_state_that_refers_to_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[object] = []
+    store = FolderStore(tmp_path / "state", syncs=True)
+    save = store.save
+    monkeypatch.setattr(checkpointer, "sync_all", calls.append)
+    monkeypatch.setattr(store, "save", lambda *args: (calls.append("save"), save(*args)))
+    actor = Writer(tmp_path / "map")
+    actor.files.write(7, b"image")
+    (file,) = actor.files.unsynced_files()
+    Checkpointer(store).write(actor, {"keyframe": [7]})
+    synced, then = calls
+    assert then == "save"
+    assert isinstance(synced, list)
+    assert {file, file.parent} <= set(synced)
+    assert unsynced_of(tmp_path / "state") == ()
+
+
 def test_unsynced_files_are_synced_and_forgotten_if_no_generation_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

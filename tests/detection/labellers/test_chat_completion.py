@@ -7,7 +7,7 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler
 from math import sqrt
@@ -243,22 +243,42 @@ def test_failed_attempts_leak_no_threads_or_files() -> None:
         assert (open_resources() <= before).all()
 
 
-def test_unresponsive_address_falls_back_to_the_next_one(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The first address accepts no connection because its queue is full."""
-    with serving(replies_with("cup", 0.5)) as server, contextlib.ExitStack() as opened:
-        port = int(server.url.split(":")[2].split("/")[0])
-        full = opened.enter_context(socket.create_server(("127.0.0.2", port), backlog=0))
+@contextlib.contextmanager
+def silent(host: str, port: int) -> Iterator[int]:
+    """Open a port that answers no connection, because its queue is full, and yield the port."""
+    with contextlib.ExitStack() as opened:
+        full = opened.enter_context(socket.create_server((host, port), backlog=0))
         for _ in range(6):
             queued = opened.enter_context(socket.socket())
             queued.setblocking(False)
             queued.connect_ex(full.getsockname())
-        addresses = [
-            (socket.AF_INET, socket.SOCK_STREAM, 6, "", (host, port))
-            for host in ("127.0.0.2", "127.0.0.1")
-        ]
-        monkeypatch.setattr(socket, "getaddrinfo", lambda *_args, **_kwargs: addresses)
+        yield full.getsockname()[1]
+
+
+def resolve_to(monkeypatch: pytest.MonkeyPatch, hosts: Sequence[str], port: int) -> None:
+    """Give every host name these addresses."""
+    addresses = [(socket.AF_INET, socket.SOCK_STREAM, 6, "", (host, port)) for host in hosts]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_args, **_kwargs: addresses)
+
+
+def test_silent_addresses_of_a_server_share_one_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
+    with silent("127.0.0.1", 0) as port:
+        resolve_to(monkeypatch, ["127.0.0.1"] * 6, port)
+        endpoint = {"timeout_s": 1.0, "attempts": 1}
+        client = labeller(f"http://six-addresses:{port}/v1", views=1, endpoint=endpoint)
+        start_s = time.monotonic()
+        with pytest.raises(EndpointError, match=r"did not answer within 1\.0 s"):
+            client.label([RED])
+        assert time.monotonic() - start_s < 4, "six timeouts one after the other take 6 s"
+
+
+def test_unresponsive_address_falls_back_to_the_next_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with serving(replies_with("cup", 0.5)) as server, contextlib.ExitStack() as opened:
+        port = int(server.url.split(":")[2].split("/")[0])
+        opened.enter_context(silent("127.0.0.2", port))
+        resolve_to(monkeypatch, ["127.0.0.2", "127.0.0.1"], port)
         client = labeller(f"http://two-addresses:{port}/v1", views=1, endpoint={"timeout_s": 30})
         start_s = time.monotonic()
         assert client.label([RED]) == [("cup", pytest.approx(0.5))]
