@@ -216,9 +216,9 @@ class Checkpointer:
         """
         metrics: dict[str, float] = {}
         if isinstance(self._store, FolderStore):
-            with suppress(OSError):  # A failed save says so, if the folder was removed.
-                files = os.scandir(self._store.folder / self._name)
-                metrics["state_mb"] = sum(file.stat().st_size for file in files) / 1e6
+            with suppress(OSError):  # The folder does not exist before the first save.
+                metrics["state_mb"] = _size_bytes(self._store.folder / self._name) / 1e6
+            with suppress(OSError):
                 metrics["disk_free_mb"] = shutil.disk_usage(self._store.folder).free / 1e6
         if self._failed:
             metrics["checkpoint_failing"] = float(self.is_unsaved)
@@ -226,3 +226,17 @@ class Checkpointer:
         if self._has_fallen_back:
             metrics["fell_back"] = 1.0  # The last state was damaged, and an older one is used.
         return metrics
+
+
+def _size_bytes(folder: Path) -> int:
+    """Return the size of the files of a folder.
+
+    Raises:
+        OSError: The folder cannot be read.
+    """
+    size = 0
+    with os.scandir(folder) as files:
+        for file in files:
+            with suppress(FileNotFoundError):  # A generation was deleted or renamed meanwhile.
+                size += file.stat().st_size
+    return size

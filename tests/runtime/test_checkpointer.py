@@ -65,6 +65,21 @@ def test_files_of_an_actor_are_synced_before_the_state_that_refers_to_them(
     assert unsynced_of(tmp_path / "state") == ()
 
 
+def test_sizes_are_reported_while_files_of_a_generation_disappear(tmp_path: Path) -> None:
+    store = FolderStore(tmp_path / "state")
+    checkpoints = Checkpointer(store)
+    actor = checkpoints.restore_actor(lambda: Writer(tmp_path / "map"))
+    assert "state_mb" not in checkpoints.metrics(), "nothing is saved yet"
+    checkpoints.write(actor, {"keyframe": [7]})
+    folder = tmp_path / "state" / actor.name
+    size_mb = checkpoints.metrics()["state_mb"]
+    assert size_mb == sum(file.stat().st_size for file in folder.iterdir()) / 1e6 > 0
+    (folder / "renamed").symlink_to(folder / "gone")  # Listed, but without a size.
+    metrics = checkpoints.metrics()
+    assert metrics["state_mb"] == size_mb
+    assert metrics["disk_free_mb"] > 0
+
+
 def test_unsynced_files_are_synced_and_forgotten_if_no_generation_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
