@@ -1,6 +1,8 @@
 """Forecast for a state folder, from the sizes and times of its files."""
 
+import os
 import shutil
+from contextlib import suppress
 from itertools import accumulate
 from pathlib import Path
 
@@ -75,11 +77,10 @@ def forecast_of_state(folder: Path) -> Forecast:
 def _files(folder: Path) -> list[tuple[float, float]]:
     """Return time of the last change, in seconds, and size in MB of all files below a folder."""
     found: list[tuple[float, float]] = []
-    for path in folder.rglob("*"):
-        try:
-            about = path.stat()
-        except FileNotFoundError:  # A running service has removed or renamed the file.
-            continue
-        if path.is_file():
-            found.append((about.st_mtime, about.st_size / 1e6))
+    # A running service removes and renames files and folders meanwhile; these are left out.
+    for parent, _, names in os.walk(folder):
+        for name in names:
+            with suppress(FileNotFoundError):
+                about = os.stat(os.path.join(parent, name))
+                found.append((about.st_mtime, about.st_size / 1e6))
     return found

@@ -7,6 +7,7 @@ from math import inf
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 
 from ldo_service.actors.mapper import Mapper
@@ -114,7 +115,9 @@ def test_flat_and_shrinking_values_reach_no_bound(step: float) -> None:
     assert result.reached == []
     assert {bound.time_s for bound in result.bounds} == {inf}
     taken = "-120.00 MB of" if step else "no clear amount of"
-    assert f"no keyframe; a minute takes {taken} memory, {taken} disk" in text(result)
+    assert f"no clear rate of keyframes; a minute takes {taken} memory, {taken} disk" in text(
+        result
+    )
     assert text(result).endswith("if this goes on, there is no bound within 24 h")
 
 
@@ -123,6 +126,37 @@ def test_noise_without_growth_is_no_trend() -> None:
     assert Trend.of(range(10), noisy).per_s == 0.0
     growing = [10.0 * t + noise for t, noise in enumerate(noisy)]
     assert Trend.of(range(10), growing).per_s == pytest.approx(10.0, abs=0.5)
+
+
+@pytest.mark.parametrize("count", [6, 20])
+def test_single_step_is_no_trend(count: int) -> None:
+    """A state that was saved once, or one keyframe, does not tell when the next one comes."""
+    jitter = [0.2 * (number % 2) for number in range(count)]
+    for at in range(1, count):
+        values = [300.0 + jitter[number] + 100.0 * (number >= at) for number in range(count)]
+        assert Trend.of(range(count), values) == Trend(values[-1], 0.0)
+
+
+def test_step_does_not_add_to_the_trend_of_the_other_values() -> None:
+    values = [0.5 * number + 100.0 * (number >= 7) for number in range(20)]
+    assert Trend.of(range(20), values).per_s == pytest.approx(0.5, rel=0.15)
+
+
+def test_two_keyframes_in_a_window_are_a_trend() -> None:
+    values = [float((number >= 5) + (number >= 15)) for number in range(20)]
+    assert Trend.of(range(20), values).per_s == pytest.approx(0.1, rel=0.3)
+
+
+def test_memory_that_is_freed_regularly_is_no_growth() -> None:
+    for period in (4, 5, 7, 10):
+        values = [300.0 + number % period for number in range(20)]
+        assert Trend.of(range(20), values).per_s == 0.0
+
+
+def test_scatter_of_a_constant_service_rarely_is_a_trend() -> None:
+    random = np.random.default_rng(1)
+    clear = [Trend.of(range(6), random.normal(300, 1, 6)).per_s != 0 for _ in range(2000)]
+    assert np.mean(clear) < 0.02
 
 
 def test_disk_that_other_programs_fill_is_full_earlier() -> None:
