@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from datetime import date
 from importlib.metadata import PackageNotFoundError, version
+from math import inf
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -64,9 +65,8 @@ EXPERIMENTAL = {
     "cuda": "Mapping on a GPU is experimental until `ldo bench --device cuda` has passed on it"
 }
 REINSTALL = "`.venv/bin/pip install -e .` in the clone of LDO-SLAM installs all libraries."
-# Time for which a running service is observed, seconds: twenty heartbeats, and ten or more
-# keyframes of a moving camera.
-WINDOW_S = 10.0
+# Time for which a running service is observed, seconds: six heartbeats, and six keyframes at 2 Hz.
+WINDOW_S = 3.0
 Check = Annotated[
     Literal["service", "calibration", "forecast"],
     tyro.conf.Positional,
@@ -112,12 +112,12 @@ def doctor(
     prints a forecast for the state folder DIR.
 
       ldo doctor
-      ldo doctor --window-s 60
+      ldo doctor --window-s 300
       ldo doctor forecast states/robot
       ldo doctor calibration runs/desk
     """
-    if window_s <= 0:
-        raise ConfigError(f"--window-s {window_s:g} must be positive.")
+    if not 0 < window_s < inf:
+        raise ConfigError(f"--window-s {window_s:g} must be positive and finite.")
     if check == "service":
         if folder is not None:
             raise ConfigError(

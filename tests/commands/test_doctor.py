@@ -67,9 +67,10 @@ def test_check_of_a_folder_without_a_folder_is_an_error(
         doctor.doctor(check)
 
 
-def test_window_must_be_positive() -> None:
-    with pytest.raises(ConfigError, match="--window-s 0 must be positive"):
-        doctor.doctor(window_s=0.0)
+@pytest.mark.parametrize("window_s", [0.0, float("nan"), float("inf")])
+def test_window_must_be_positive_and_finite(window_s: float) -> None:
+    with pytest.raises(ConfigError, match=f"--window-s {window_s:g} must be positive and finite"):
+        doctor.doctor(window_s=window_s)
 
 
 def test_every_extra_of_the_package_is_checked() -> None:
