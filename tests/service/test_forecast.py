@@ -155,7 +155,7 @@ def test_memory_that_is_freed_regularly_is_no_growth() -> None:
 
 def test_scatter_of_a_constant_service_rarely_is_a_trend() -> None:
     random = np.random.default_rng(1)
-    clear = [Trend.of(range(6), random.normal(300, 1, 6)).per_s != 0 for _ in range(2000)]
+    clear = [Trend.of(range(6), random.normal(300, 1, 6).tolist()).per_s != 0 for _ in range(2000)]
     assert np.mean(clear) < 0.02
 
 
