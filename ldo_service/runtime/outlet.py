@@ -101,8 +101,7 @@ class Outlet:
         self._open(transport)
 
     def _open(self, transport: Transport) -> None:
-        self._transport = transport
-        topic = self.topic.name
+        self._transport, topic = transport, self.topic.name
         self._publisher = transport.publisher(data_key(topic))
         self._retransmissions = transport.publisher(retransmit_key(topic))
         self._hellos = transport.publisher(producer_hello_key(topic))
