@@ -167,7 +167,7 @@ class Forecast:
         start = (
             f"a keyframe every {per_s:.2g} s takes"
             if is_mapping
-            else "no clear rate of keyframes; a minute takes"
+            else "no clear rate of keyframes (a longer window may show one); a minute takes"
         )
         return f"{start} {', '.join(taken)}"
 

@@ -115,9 +115,8 @@ def test_flat_and_shrinking_values_reach_no_bound(step: float) -> None:
     assert result.reached == []
     assert {bound.time_s for bound in result.bounds} == {inf}
     taken = "-120.00 MB of" if step else "no clear amount of"
-    assert f"no clear rate of keyframes; a minute takes {taken} memory, {taken} disk" in text(
-        result
-    )
+    assert "no clear rate of keyframes (a longer window may show one)" in text(result)
+    assert f"; a minute takes {taken} memory, {taken} disk" in text(result)
     assert text(result).endswith("if this goes on, there is no bound within 24 h")
 
 
