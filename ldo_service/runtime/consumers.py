@@ -26,10 +26,13 @@ class Consumer:
     # Time of the stage's `RunningClock` at which the window was found full, seconds; None while it
     # is not full.
     shut_since_s: float | None = None
-    # Offset after the last message that was sent to a consumer with policy Backlog, and the
-    # event-loop time at which it was sent. Unused for other consumers.
+    # Offset after the last message that was sent to a consumer with policy Backlog. This field and
+    # the next two are unused for other consumers.
     pushed: int = 0
-    pushed_at_s: float = 0.0
+    # Offset of the first message that has not arrived, and a time at which it was certainly sent
+    # (event-loop time). Messages sent after it do not change this time.
+    missing_seq: int = -1
+    missing_since_s: float = 0.0
 
 
 class Consumers:
@@ -149,6 +152,7 @@ class Consumers:
         self._evicted.pop(name, None)
         consumer = self._known.setdefault(name, Consumer(handled=seq))
         consumer.alive, consumer.shut_since_s, consumer.repeated_from = True, None, -1
+        consumer.missing_seq = -1
         consumer.arrived = consumer.limit = consumer.pushed = consumer.handled
         consumer.is_awaited = not (has_backlog or name in self.with_backlog)
 
@@ -161,7 +165,9 @@ class Consumers:
         """
         for consumer in self._known.values():
             if not consumer.is_awaited and consumer.pushed == seq < consumer.limit:
-                consumer.pushed, consumer.pushed_at_s = seq + 1, now_s
+                if seq == consumer.arrived:
+                    consumer.missing_seq, consumer.missing_since_s = seq, now_s
+                consumer.pushed = seq + 1
 
     def next_of_backlog(self, name: str, seq: int, now_s: float, repeat_after_s: float) -> range:
         """Return the offsets of the messages to send now to a consumer with policy `Backlog`.
@@ -172,15 +178,20 @@ class Consumers:
             name: Name of the consumer.
             seq: Offset of the first message that was not published.
             now_s: Event-loop time at which the messages count as sent.
-            repeat_after_s: Time after which messages that have not arrived count as lost, seconds.
+            repeat_after_s: Time after which the first message that has not arrived counts as lost,
+                seconds, even if later messages were sent meanwhile.
         """
         consumer = self._known[name]
-        is_overdue = now_s - consumer.pushed_at_s > repeat_after_s
+        if consumer.missing_seq != consumer.arrived:
+            consumer.missing_seq, consumer.missing_since_s = consumer.arrived, now_s
+        is_overdue = now_s - consumer.missing_since_s > repeat_after_s
         if consumer.pushed < consumer.arrived or is_overdue:
             consumer.pushed = consumer.arrived
         messages = range(consumer.pushed, min(seq, consumer.limit))
         if messages:
-            consumer.pushed, consumer.pushed_at_s = messages.stop, now_s
+            if messages.start == consumer.arrived:
+                consumer.missing_since_s = now_s
+            consumer.pushed = messages.stop
         return messages
 
     def skip(self, first: int, since: int = 0) -> bool:

@@ -64,3 +64,17 @@ def test_consumer_waiting_for_its_disk_is_not_stalled() -> None:
         consumers.grant(waiting)
         assert consumers.stalled(now_s, patience_s=10, seq=4) == []
     assert consumers.stalled(now_s=71, patience_s=10, seq=4) == ["mapper"], "its heartbeats stopped"
+
+
+def test_lost_message_of_a_backlog_is_sent_again_although_newer_ones_follow_it() -> None:
+    consumers = Consumers(["detector"], with_backlog=["detector"])
+    consumers.join("detector", 0, has_backlog=True)
+    granted = Credit("detector", 1, handled=0, arrived=0, limit=64, gap=True)
+    consumers.grant(granted)
+    assert list(consumers.next_of_backlog("detector", 0, 0.0, 0.25)) == []
+    for seq in range(5):  # Message 0 is lost, and a new message follows five times a second.
+        now_s = 1.0 + 0.2 * seq
+        consumers.note_sent(seq, now_s)
+        consumers.grant(granted)
+        again = consumers.next_of_backlog("detector", seq + 1, now_s + 0.15, 0.25)
+        assert list(again) == {0: [], 1: [0, 1], 2: [], 3: [0, 1, 2, 3], 4: []}[seq]
