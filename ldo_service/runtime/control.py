@@ -9,8 +9,11 @@ ignore the first new corrections.
 If a reset does not reach all actors, some states are from before the reset and some from after it.
 `Control` therefore writes a marker to the disk before the first actor is reset. It removes the
 marker once the empty states of all actors are on the disk as a generation, the copy of all states
-to which the service falls back (`generations`). While the marker exists, no frames are taken, and
+to which the service falls back (`generations`). While the marker exists, all actors are paused, and
 the next start of the service completes the reset.
+
+An actor that is reset connects to its producers only when it is resumed. Before, a producer that is
+not reset yet would send it messages of the old run.
 """
 
 import asyncio
@@ -179,10 +182,11 @@ class Control:
             await self._replace_generations()
             await asyncio.to_thread(self._remove_reset_marker)
         except ControlError as error:
-            with suppress(ControlError):
-                await self._resume_actors()
             if not self._is_reset_pending:
+                with suppress(ControlError):
+                    await self._resume_actors()
                 raise
+            # The actors stay paused: some still have messages of the old run for the others.
             raise ControlError(
                 f"{error} Frames are dropped until the reset is complete. A restart of the service "
                 "completes it too."
@@ -214,8 +218,8 @@ class Control:
         )
 
     async def _resume_actors(self) -> None:
-        """Resume all actors, except the sources while frames must not be taken."""
-        held = self._sources if self._is_paused or self._is_reset_pending else ()
+        """Resume all actors, except the sources while the service is paused."""
+        held = self._sources if self._is_paused else ()
         await self._each("resume", [actor for actor in self._actors if actor not in held])
 
     def _mark_reset(self) -> None:
@@ -293,11 +297,12 @@ class Control:
 
     # --- actors that were restarted ---------------------------------------------------------------
     def _presence(self, name: str, alive: bool) -> None:
-        """Send a restarted source actor the command that it may not have found on the disk."""
-        if not alive or name not in self._sources:
+        """Send a restarted actor the command that it may not have found on the disk."""
+        if not alive or name not in self._actors:
             return
-        markers = self._pause_marker, self._reset_marker
-        if self._is_paused or self._is_reset_pending:
+        is_source = name in self._sources
+        markers = [self._reset_marker, *([self._pause_marker] if is_source else [])]
+        if self._is_reset_pending or (is_source and self._is_paused):
             self._start(self._commander.order("pause", name, self._timeout_s))
         elif any(marker is not None and marker.exists() for marker in markers):
             # The disk did not remove the marker, so the actor has started paused.

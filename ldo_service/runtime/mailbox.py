@@ -74,6 +74,9 @@ class Mailbox:
         self._ready = asyncio.Event()
         self._wake_pending = self._grant_pending = False
         self._closed, self._held = False, is_held
+        # False until `resume` if a paused stage starts or is reset: its producers may still have
+        # messages of the old run until the reset has reached them.
+        self._connects = not is_held
         # True while the stage takes no messages because its state cannot be saved. Producers then
         # do not evict this actor.
         self.waits_for_disk = False
@@ -168,6 +171,8 @@ class Mailbox:
             return
         start = welcome.starts.get(self._consumer)
         with self._lock:
+            if not self._connects:
+                return
             lost = 0 if start is None else inlet.welcome(welcome.epoch, start)
             self._ask_for_grants()
         if lost:
@@ -273,7 +278,9 @@ class Mailbox:
     def resume(self) -> None:
         """Let `take` return deliveries again, after `pause`."""
         with self._lock:
-            self._held = False
+            self._held, is_connecting, self._connects = False, not self._connects, True
+        if is_connecting:
+            self.send_credits()
         self._ready.set()
 
     @property
@@ -282,8 +289,9 @@ class Mailbox:
         return self._held
 
     def reset(self) -> None:
-        """Clear all queues and connect to the producers again."""
+        """Clear all queues and connect to the producers again, after `resume` if paused."""
         with self._lock:
+            self._connects = not self._held
             for inlet in self._inlets.values():
                 inlet.reset()
             self._keep_only_waiting()
@@ -302,6 +310,8 @@ class Mailbox:
         """
         with self._lock:
             self._grant_pending = False
+            if not self._connects:
+                return
         for inlet in self._inlets.values():
             if isinstance(inlet, LosslessInlet):
                 self._send_grant(inlet)

@@ -307,7 +307,7 @@ class Service:
                 journal=self._journal(box.name, Path(config.mapper.image_folder)),
                 heartbeat=start_heartbeat() if self.only else None,
                 suspects=suspects,
-                starts_paused=lambda: _is_fed_from_outside(box) and self._is_paused(),
+                starts_paused=lambda: self._is_paused(box),
             )
         except (KeyError, ValueError, TypeError, IndexError) as error:
             raise ConfigError(
@@ -316,9 +316,10 @@ class Service:
                 "map."
             ) from error
 
-    def _is_paused(self) -> bool:
-        """Return whether a file says that the service takes no frames; see `Control`."""
-        return any((self.state / marker).exists() for marker in (PAUSE_MARKER, RESET_MARKER))
+    def _is_paused(self, box: ActorSpec) -> bool:
+        """Return whether a file says that an actor takes no messages; see `Control`."""
+        is_paused = _is_fed_from_outside(box) and (self.state / PAUSE_MARKER).exists()
+        return is_paused or (self.state / RESET_MARKER).exists()
 
     def _journal(self, actor: str, map_folder: Path) -> Journal:
         if self.recording is None:

@@ -63,7 +63,9 @@ class Scene:
         reset_marker: Path | None = None,
         pause_marker: Path | None = None,
         generations: GenerationKeeper | None = None,
+        actors: tuple[str, ...] = ("source", "collector"),
     ) -> None:
+        self._actors = actors
         self._markers = reset_marker, pause_marker, generations
         self.transport, self.seen = MemoryTransport(), []
         self.source = Stage(
@@ -75,9 +77,8 @@ class Scene:
     @asynccontextmanager
     async def started(self) -> AsyncIterator[None]:
         async with running(self.source, self.collector):
-            actors = ("source", "collector")
             self.control = Control(
-                *(self.transport, actors, ("source",), "here", self._timeout_s),
+                *(self.transport, self._actors, ("source",), "here", self._timeout_s),
                 *self._markers,
             )
             yield
@@ -233,7 +234,7 @@ async def test_restarted_source_is_paused_again() -> None:
         await eventually(lambda: restarted.health().paused)
 
 
-async def test_incomplete_reset_holds_the_sources_until_it_is_repeated(tmp_path: Path) -> None:
+async def test_incomplete_reset_holds_all_actors_until_it_is_repeated(tmp_path: Path) -> None:
     store, marker = LockedStore(), tmp_path / "reset"
     scene = Scene(store, reset_marker=marker)
     async with scene.started():
@@ -244,7 +245,7 @@ async def test_incomplete_reset_holds_the_sources_until_it_is_repeated(tmp_path:
         assert "source OSError: read-only" in answer.message
         assert marker.exists(), "the next start has to complete the reset"
         source, collector = scene.health()
-        assert (source.paused, collector.paused) == (True, False)
+        assert (source.paused, collector.paused) == (True, True)
         refused = await scene.request("resume")
         assert "the last reset is not complete" in refused.message
         store.is_locked = False
@@ -252,6 +253,27 @@ async def test_incomplete_reset_holds_the_sources_until_it_is_repeated(tmp_path:
         assert not marker.exists()
         scene.send(2)
         await eventually(lambda: scene.seen == [1, 2])
+
+
+async def test_actor_that_is_reset_before_its_producer_takes_nothing_of_the_old_run() -> None:
+    scene = Scene(actors=("collector", "source"))
+    async with scene.started():
+        assert await scene.control._commander.order("pause", "collector", 5.0) == ""
+        scene.send(1)
+        await eventually(lambda: scene.source.health().steps == 1)
+        assert (await scene.request("reset")).ok
+        scene.send(2)
+        await eventually(lambda: scene.seen)
+        assert scene.seen == [2]
+
+
+async def test_any_restarted_actor_is_paused_while_a_reset_is_not_complete(tmp_path: Path) -> None:
+    scene = Scene(LockedStore(), reset_marker=tmp_path / "reset")
+    async with scene.started():
+        assert not (await scene.request("reset")).ok
+        restarted = Stage(lambda: Collector([]), scene.transport, config=QUICK)
+        async with running(restarted):
+            await eventually(lambda: restarted.health().paused)
 
 
 async def test_reset_of_the_previous_process_is_completed(tmp_path: Path) -> None:
@@ -265,7 +287,7 @@ async def test_reset_of_the_previous_process_is_completed(tmp_path: Path) -> Non
         await eventually(lambda: not scene.health()[0].paused)
 
 
-async def test_reset_marker_that_cannot_be_removed_holds_the_sources(
+async def test_reset_marker_that_cannot_be_removed_holds_all_actors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The next start would delete a map that is made while the marker exists."""
@@ -280,7 +302,7 @@ async def test_reset_marker_that_cannot_be_removed_holds_the_sources(
                 read_only.setattr(Path if method == "unlink" else control, method, fail)
                 answer = await scene.request("reset")
             assert "cannot be removed: Read-only" in answer.message
-            assert [health.paused for health in scene.health()] == [True, False]
+            assert [health.paused for health in scene.health()] == [True, True]
         assert (await scene.request("reset")).ok
         assert not any(health.paused for health in scene.health())
 

@@ -41,9 +41,11 @@ async def test_only_an_actor_on_another_machine_syncs_every_step_by_default(
     assert [store.syncs for store in stores] == [is_remote]
 
 
-@pytest.mark.parametrize("marker", [PAUSE_MARKER, RESET_MARKER])
-async def test_only_actors_that_take_frames_start_paused_in_a_paused_service(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, marker: str
+@pytest.mark.parametrize(
+    ("marker", "expected"), [(PAUSE_MARKER, [True, False]), (RESET_MARKER, [True, True])]
+)
+async def test_pause_is_for_actors_that_take_frames_and_an_incomplete_reset_for_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, marker: str, expected: list[bool]
 ) -> None:
     are_paused: list[Callable[[], bool]] = []
 
@@ -56,7 +58,7 @@ async def test_only_actors_that_take_frames_start_paused_in_a_paused_service(
         service._stage(actor_spec(actor), transport(), {}, asyncio.Lock())
     assert [is_paused() for is_paused in are_paused] == [False, False]
     (tmp_path / marker).touch()
-    assert [is_paused() for is_paused in are_paused] == [True, False]
+    assert [is_paused() for is_paused in are_paused] == expected
 
 
 @pytest.mark.parametrize("is_state_kept", [True, False])
