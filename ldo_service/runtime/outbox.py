@@ -11,8 +11,8 @@ from ldo_service.transport.flow_control import UnackedMessage
 # Number of newest messages that stay in memory although the log on disk has them.
 # Retransmissions to consumers that are not far behind then need not read the disk.
 MESSAGES_IN_MEMORY = 8
-# Maximum size of handled messages that are retained in memory for the next generation, bytes: some
-# tens of keyframes.
+# Maximum size of handled messages that are retained in memory for the next generation, or on disk
+# for the first one, bytes: some tens of keyframes.
 MAX_RETAINED_BYTES = 64_000_000
 
 
@@ -31,6 +31,7 @@ class Outbox:
         log: MessageLog | None = None,
         max_bytes: int | None = None,
         retained_from: int | None = None,
+        is_kept: bool = True,
     ) -> None:
         """Initialize with the messages of the previous process.
 
@@ -41,12 +42,15 @@ class Outbox:
                 dropped. None: the log or the consumers' windows limit the size of the outbox.
             retained_from: Number of the first message that a generation of the states needs; see
                 `runtime.generations`. None if there is no generation.
+            is_kept: False if `retained_from` is for the first generation, which may never be kept.
+                Messages on disk are then retained up to `MAX_RETAINED_BYTES`.
         """
         self._lock = Lock()
         self._memory = deque(unhandled)
         self._log, self._max_bytes = log, max_bytes
         self._bytes = sum(len(message.body) for message in self._memory)
         self._dropped = 0  # Messages dropped from memory.
+        self._is_kept = is_kept
         # First unhandled message when each of the last generations was kept; see `keep`.
         self._handled_at_keeps = [] if retained_from is None else [retained_from]
 
@@ -159,6 +163,7 @@ class Outbox:
             del self._handled_at_keeps[:-2]
         del self._handled_at_keeps[1:-2]  # The others are never used.
         self._handled_at_keeps.append(handled)
+        self._is_kept = True
 
     def forget(self, before: int) -> None:
         """Delete the messages before number `before`, which all consumers have handled.
@@ -167,6 +172,8 @@ class Outbox:
         An outbox that is not on the disk keeps them only while it has at most
         `MAX_RETAINED_BYTES`.
         """
+        if self._log and not self._is_kept and self._log.size_bytes > MAX_RETAINED_BYTES:
+            self._handled_at_keeps = [before]
         needed = self.first_needed(before)
         if self._log:
             self._log.forget(needed, handled=before)
@@ -193,6 +200,6 @@ class Outbox:
         with self._lock:
             self._memory.clear()
             self._bytes = 0
-            self._handled_at_keeps = []
+            self._handled_at_keeps = [0] if self._log and self._handled_at_keeps else []
         if self._log:
             self._log.restart(epoch)

@@ -71,8 +71,9 @@ class OutletOpener:
     def _outbox(
         self, source: str, topic: Topic, past: OutletPosition, *, is_logged: bool
     ) -> Outbox:
-        retained_from = past.handled if self.store.is_kept(source) else None
+        is_kept = self.store.is_kept(source)
         if not is_logged:
+            retained_from = past.handled if is_kept else None
             return Outbox(past.unhandled, retained_from=retained_from)
         max_bytes = round(self.config.backlog_mb * 1e6)
         folder = self.store.backlog_folder(source)
@@ -86,7 +87,9 @@ class OutletOpener:
             max_bytes=max_bytes,
             syncs=self.store.syncs,
         )
-        return Outbox(log=log, retained_from=retained_from)
+        # The consumers keep their states for the first generation before this producer does, so it
+        # must still have the messages that they handle meanwhile.
+        return Outbox(log=log, retained_from=past.handled, is_kept=is_kept)
 
 
 class Outlets:

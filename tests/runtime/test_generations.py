@@ -14,10 +14,15 @@ from ldo_service.runtime.generations import (
     problem_of_states,
 )
 from ldo_service.runtime.outbox import MAX_RETAINED_BYTES, Outbox
+from ldo_service.runtime.outlets import OutletOpener
+from ldo_service.runtime.supervision_policy import SupervisionConfig
 from ldo_service.storage import message_log
 from ldo_service.storage.message_log import MessageLog
 from ldo_service.storage.state_store import FolderStore
-from ldo_service.transport.flow_control import UnackedMessage
+from ldo_service.transport.flow_control import OutletPosition, UnackedMessage
+from ldo_service.transport.interface import MemoryTransport
+
+from .fake_actors import NUMBERS
 
 ACTORS = ("tracker", "mapper", "optimizer")
 TOPIC = "keyframe/new"
@@ -167,6 +172,26 @@ def test_retained_messages_that_exceed_the_log_do_not_count_as_dropped(
         outbox.add(UnackedMessage(seq, b"", bytes(100)))
         outbox.store()
     assert outbox.dropped == outbox.first(60) - 29
+
+
+def test_message_handled_before_the_first_generation_is_retained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A consumer that kept its state before it handled the message needs it in that generation."""
+    monkeypatch.setattr(message_log, "SEGMENT_BYTES", 100)
+    monkeypatch.setattr("ldo_service.runtime.outbox.MAX_RETAINED_BYTES", 1000)
+    logged = {NUMBERS.name: frozenset({"slow"})}
+    opener = OutletOpener(
+        MemoryTransport(), SupervisionConfig(), FolderStore(tmp_path), logged, logged, print
+    )
+    outbox = opener._outbox("source", NUMBERS, OutletPosition(1, 0), is_logged=True)
+    for seq in range(30):
+        outbox.add(UnackedMessage(seq, b"", bytes(100)))
+        outbox.store()
+        outbox.forget(seq + 1)
+        if seq == 3:
+            assert outbox.first_needed(4) == outbox.first(4) == 0
+    assert outbox.first(30) > 10, "without generations, the disk holds 1000 bytes of them"
 
 
 def test_outbox_without_generations_retains_nothing() -> None:
