@@ -62,7 +62,7 @@ class Consumers:
         self.with_backlog = frozenset(with_backlog)
         self._known = {
             name: Consumer(is_awaited=name not in self.with_backlog, handled=handled)
-            for name in expected
+            for name in sorted(expected)  # The order of a set differs between processes.
         }
         self.expected = frozenset(self._known)
         self._evicted: dict[str, int] = {}  # Value of `handled` at the eviction, by consumer.

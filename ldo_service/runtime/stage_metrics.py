@@ -1,7 +1,6 @@
 """Counters and step times of a stage, for its health message."""
 
 import os
-import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,7 +14,7 @@ from ldo_service.schemas import Health, Message
 
 from ._heartbeat import Heartbeat
 from .process import available_memory_mb, resident_mb
-from .supervision_policy import RunningClock
+from .supervision_policy import RunningClock, monotonic_s
 
 # Consecutive dead letters after which an actor counts as failing: one or two have their cause in
 # the messages, more of them in the actor.
@@ -38,7 +37,7 @@ class StageMetrics:
     step_ms: deque[float] = field(default_factory=lambda: deque(maxlen=200))
     last_step_ms: float = 0.0  # Duration of the last step, ms.
     last_stamp_ns: int = 0  # Stamp of the last handled message.
-    finished_at_s: float = field(default_factory=time.monotonic)  # End of the last step.
+    finished_at_s: float = field(default_factory=monotonic_s)  # End of the last step.
     started_at_s: float | None = None  # Start of the current step; None between steps.
     facts: dict[str, float] = field(
         default_factory=dict
@@ -72,7 +71,7 @@ class StageMetrics:
         if is_timed:
             self.step_ms.append(self.last_step_ms)
         self.last_stamp_ns = message.stamp_ns
-        self.finished_at_s = time.monotonic()
+        self.finished_at_s = monotonic_s()
 
     def record_dead_letter(self) -> None:
         """Count a message that failed twice."""
@@ -87,7 +86,7 @@ class StageMetrics:
 
     def health(self, **of_the_stage: Any) -> Health:
         """Return the health message; `of_the_stage` has the fields that only the stage knows."""
-        step_ms = np.array(self.step_ms or [0.0])
+        median_ms, slow_ms = np.percentile(self.step_ms or [0.0], (50, 95)).tolist()
         facts, available_mb = self.facts, available_memory_mb()
         if available_mb is not None:
             facts = {**facts, "memory_available_mb": available_mb}
@@ -100,10 +99,10 @@ class StageMetrics:
             failures=self.failures,
             restarts=self.restarts,
             dead_lettered=self.dead_lettered,
-            step_age_s=time.monotonic() - self.finished_at_s,
+            step_age_s=monotonic_s() - self.finished_at_s,
             current_step_s=self.busy_s,
-            step_ms_p50=float(np.percentile(step_ms, 50)),
-            step_ms_p95=float(np.percentile(step_ms, 95)),
+            step_ms_p50=median_ms,
+            step_ms_p95=slow_ms,
             rss_mb=resident_mb(),
             # A metric that is no number must not suppress the heartbeat.
             metrics={name: value for name, value in facts.items() if isfinite(value)},

@@ -8,6 +8,15 @@ from dataclasses import dataclass
 from ldo_service.errors import ConfigError, RestartsExhausted, named
 
 
+def monotonic_s() -> float:
+    """Return the time of the monotonic clock, seconds.
+
+    Defaults name this function instead of `time.monotonic`, so that a simulation can replace the
+    clock.
+    """
+    return time.monotonic()
+
+
 class RestartBudget:
     """Restart budget of an actor: at most `max_restarts` within `window_s`.
 
@@ -67,7 +76,7 @@ class LogLimit:
         clock: Monotonic clock, seconds.
     """
 
-    def __init__(self, period_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, period_s: float, clock: Callable[[], float] = monotonic_s) -> None:
         self._period_s, self._clock = period_s, clock
         self._due_at_s = float("-inf")
 
@@ -92,7 +101,7 @@ class RunningClock:
     # causes smaller delays.
     MAX_LATE_S = 2.0
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, clock: Callable[[], float] = monotonic_s) -> None:
         self._clock = clock
         self._last_s: float | None = None
         self._stopped_s = 0.0

@@ -285,7 +285,7 @@ class FolderStore:
             used.update(writing.sources.values())
         for contents in (self._contents[actor], *kept.values()):
             used.update(contents.files.values())
-        for file in set(files) - used:
+        for file in sorted(set(files) - used):
             _remove(self.folder / actor / file)
 
     # --- older generations ------------------------------------------------------------------------
