@@ -24,12 +24,12 @@ BLOCK_BYTES = 4096
 class Change:
     """One operation on the disk."""
 
-    kind: str  # "write", "append", "name", "remove", "folder", "sync" or "note".
+    kind: str  # "write", "append", "truncate", "name", "remove", "folder", "sync" or "note".
     path: str = ""
     data: bytes = b""
     inode: int = 0
     source: str = ""  # Old name of a renamed file.
-    note: Any = None
+    note: Any = None  # A fact; the new size in bytes of a truncated file.
 
 
 @dataclass
@@ -190,6 +190,8 @@ def crash_state(log: DiskLog, end: int, rng: random.Random) -> CrashState:
                 is_safe = number in safe_data or is_kept
                 new = change.data if is_safe else _damaged(change.data, rng)
                 data[change.inode] = before + new
+            case "truncate":  # The service cuts off nothing but the rest of a failed write.
+                data[change.inode] = data.get(change.inode, b"")[: change.note]
             case "folder" if number in safe_names or is_kept:
                 folders.add(change.path)
             case "name" if number in safe_names or is_kept:

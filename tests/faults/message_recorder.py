@@ -98,7 +98,7 @@ class MessageRecorder:
         while self._received:
             topic, header, body = self._received.popleft()
             if topic in ALL_CREDITS:
-                self._add_credit(decode_request(memoryview(body)))
+                self.add_credit(decode_request(memoryview(body)))
             elif topic.startswith("health/"):
                 health = decode(body, Health)
                 self.health[health.actor] = time.monotonic(), health
@@ -108,13 +108,13 @@ class MessageRecorder:
     def _handle(self, message: Message, header: bytes, body: bytes) -> None:
         match message:
             case Keyframe():
-                self._add_keyframe(message, decode(header, Header), hashlib.blake2b(body).digest())
+                self.add_keyframe(message, decode(header, Header), body)
             case GraphCorrection():
                 self._add_correction(message)
             case MapDelta():
                 of = decode(header, Header)
                 self.last_delta = of.epoch, of.seq
-                self._must_grow("map", self.map_version, message.version)
+                self.must_grow("map", self.map_version, message.version)
                 self.map_version = message.version
                 self._follow(message)
             case MapSnapshot():
@@ -123,7 +123,9 @@ class MessageRecorder:
                 self.pose = message
 
     # --- invariants -------------------------------------------------------------------------------
-    def _add_keyframe(self, message: Keyframe, header: Header, digest: bytes) -> None:
+    def add_keyframe(self, message: Keyframe, header: Header, body: bytes) -> None:
+        """Check that a keyframe and its number belong to one message."""
+        digest = hashlib.blake2b(body).digest()
         if message.keyframe == 0:
             self.first_stamp_ns = message.stamp_ns
         known = self.keyframes.setdefault(message.keyframe, digest)
@@ -133,7 +135,8 @@ class MessageRecorder:
         if number != message.keyframe:
             self.violations.append(f"number {header.seq} was given to {number} and its successor")
 
-    def _add_credit(self, grant: object) -> None:
+    def add_credit(self, grant: object) -> None:
+        """Check that a consumer has not handled fewer keyframes than before."""
         if isinstance(grant, Credit):
             epoch, handled = self.handled.get(grant.consumer, (grant.epoch, 0))
             if epoch == grant.epoch and grant.handled < handled:
@@ -143,7 +146,7 @@ class MessageRecorder:
             self.handled[grant.consumer] = grant.epoch, grant.handled
 
     def _add_correction(self, message: GraphCorrection) -> None:
-        self._must_grow("graph", self.graph_version, message.graph_version)
+        self.must_grow("graph", self.graph_version, message.graph_version)
         self.graph_version = message.graph_version
         ids = message.keyframes.numpy().tolist()
         if len(set(ids)) < len(ids):
@@ -152,7 +155,8 @@ class MessageRecorder:
             self.violations.append(f"the graph lost keyframes {sorted(lost)}")
         self.placed = set(ids)
 
-    def _must_grow(self, what: str, before: int, now: int) -> None:
+    def must_grow(self, what: str, before: int, now: int) -> None:
+        """Check that a version is larger than the one before."""
         if now <= before:
             self.violations.append(f"version {now} of the {what} came after {before}")
 
