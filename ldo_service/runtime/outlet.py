@@ -76,7 +76,7 @@ class Outlet:
             expected: Names of the required consumers.
             evict_after_s: Time after which a consumer with a full window is evicted, seconds.
             on_evicted: Called with the name of an evicted consumer.
-            past: Position of the previous process: its next offset, and messages to send again.
+            past: Position of the previous process: its next offset, and messages to retransmit.
             with_backlog: Names of the required consumers with policy `Backlog`.
             outbox: Storage of unhandled messages; by default in memory.
         """
@@ -89,7 +89,7 @@ class Outlet:
         self._sent_at_s = self._loop.time()
         self._consumers = Consumers(expected, past.handled, with_backlog)
         self.outbox = outbox or Outbox(past.unhandled)
-        self._unsent = deque(past.unhandled)
+        self._unsent = deque[UnackedMessage]()
         self._changed = asyncio.Event()  # The state of a consumer changed.
         self._ahead: set[str] = set()  # Consumers with messages that this outlet never sent.
         self._repeating: asyncio.Task[None] | None = None

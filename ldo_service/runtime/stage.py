@@ -183,7 +183,6 @@ class Stage:
         try:
             if self._saver.is_unsaved:
                 await self._saver.save(self._actor)
-            await self._outlets.release()  # Outputs that the previous process staged.
             await self._publish_restored()
             while delivery := await self._next(mailbox):
                 await self._take(delivery, mailbox)

@@ -11,6 +11,7 @@ from ldo_service.runtime import Actor, In, Latest, Out, control
 from ldo_service.runtime.control import Control, ControlError
 from ldo_service.runtime.generations import GenerationKeeper
 from ldo_service.runtime.stage import Stage
+from ldo_service.runtime.stage_commands import CommandSender
 from ldo_service.schemas import ControlAnswer, ControlRequest, Health, Message, decode, encode
 from ldo_service.storage.memory_store import MemoryStore
 from ldo_service.storage.state_store import StateStore
@@ -274,6 +275,23 @@ async def test_any_restarted_actor_is_paused_while_a_reset_is_not_complete(tmp_p
         restarted = Stage(lambda: Collector([]), scene.transport, config=QUICK)
         async with running(restarted):
             await eventually(lambda: restarted.health().paused)
+
+
+async def test_restarted_actor_is_reset_although_no_consumer_takes_its_saved_outputs() -> None:
+    """During a reset, its consumer connects only when all actors are reset."""
+    store, transport = MemoryStore(), MemoryTransport()
+    required = {NUMBERS.name: frozenset({"collector"})}
+
+    def source() -> Stage:
+        return Stage(Source, transport, config=QUICK, store=store, expected=required)
+
+    async with running(killed := source()):
+        transport.deliver(LATEST_NUMBER.name, b"", encode(number(1)))
+        await eventually(lambda: killed.health().outputs[0].backpressure_waits)
+    async with running(source()):
+        sender = CommandSender(transport)
+        for what in ("pause", "reset"):
+            assert await sender.order(what, "source", 5.0) == ""
 
 
 async def test_reset_of_the_previous_process_is_completed(tmp_path: Path) -> None:
