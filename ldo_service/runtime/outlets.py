@@ -89,7 +89,8 @@ class OutletOpener:
         )
         # The consumers keep their states for the first generation before this producer does, so it
         # must still have the messages that they handle meanwhile.
-        return Outbox(log=log, retained_from=past.handled, is_kept=is_kept)
+        retained_from = past.handled if is_kept or self.store.has_generations else None
+        return Outbox(log=log, retained_from=retained_from, is_kept=is_kept)
 
 
 class Outlets:

@@ -290,12 +290,15 @@ class Service:
         parameters = actor_parameters(config)
         # The state of a remote actor has no older generation, so each save has to be synced.
         syncs = self.config.service.fsync or self.is_remote
+        has_generations = self.is_state_kept and not self.is_remote
         try:
             return Stage(
                 lambda: make(parameters),
                 transport,
                 config=stage_parameters(self.config),
-                store=FolderStore(self.state / "state", syncs=syncs),
+                store=FolderStore(
+                    self.state / "state", syncs=syncs, has_generations=has_generations
+                ),
                 expected={
                     out.topic.name: lossless_consumers(GRAPH, out.topic.name) for out in box.outputs
                 },

@@ -9,7 +9,8 @@ from .state_store import State
 class MemoryStore:
     """Store in memory; the states are lost when the process ends, but not when an actor fails."""
 
-    syncs = False  # The states do not survive a power cut.
+    # The states do not survive a power cut, and have no generations.
+    syncs = has_generations = False
 
     def __init__(self) -> None:
         self._states: dict[str, State] = {}

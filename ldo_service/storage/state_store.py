@@ -35,10 +35,8 @@ NEWEST = 0  # Number that stands for the state after the last step, which is no 
 class StateStore(Protocol):
     """Store of the last state of each actor."""
 
-    @property
-    def syncs(self) -> bool:
-        """True if a saved state survives a power cut."""
-        ...
+    syncs: bool  # A saved state survives a power cut.
+    has_generations: bool  # The service keeps older generations of the states.
 
     def backlog_folder(self, actor: str) -> Path | None:
         """Return the folder for messages that an actor's consumers have not handled.
@@ -100,14 +98,15 @@ class FolderStore:
     all actors in one generation belong together; see `runtime.generations`.
     """
 
-    def __init__(self, folder: Path, *, syncs: bool = False) -> None:
+    def __init__(self, folder: Path, *, syncs: bool = False, has_generations: bool = True) -> None:
         """Initialize the store without reading any file.
 
         Args:
             folder: Folder of all states.
             syncs: Sync every file to the disk, so that the state survives a power cut too.
+            has_generations: Whether the service keeps generations of the states.
         """
-        self.folder, self.syncs = folder, syncs
+        self.folder, self.syncs, self.has_generations = folder, syncs, has_generations
         self._saved: dict[str, State] = {}
         self._contents: dict[str, StateContents] = {}  # Current state, by actor.
         self._kept: dict[str, dict[int, StateContents]] = {}  # By actor and generation.

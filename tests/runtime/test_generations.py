@@ -194,6 +194,21 @@ def test_message_handled_before_the_first_generation_is_retained(
     assert outbox.first(30) > 10, "without generations, the disk holds 1000 bytes of them"
 
 
+def test_backlog_of_a_temporary_state_retains_no_handled_messages(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(message_log, "SEGMENT_BYTES", 100)
+    logged = {NUMBERS.name: frozenset({"slow"})}
+    store = FolderStore(tmp_path, has_generations=False)
+    opener = OutletOpener(MemoryTransport(), SupervisionConfig(), store, logged, logged, print)
+    outbox = opener._outbox("source", NUMBERS, OutletPosition(1, 0), is_logged=True)
+    for seq in range(30):
+        outbox.add(UnackedMessage(seq, b"", bytes(100)))
+        outbox.store()
+        outbox.forget(seq + 1)
+    assert outbox.size_bytes == 0, "no generation is ever kept"
+
+
 def test_outbox_without_generations_retains_nothing() -> None:
     outbox = outbox_of(5)
     outbox.forget(4)

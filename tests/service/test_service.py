@@ -26,7 +26,7 @@ def transport() -> ZenohTransport:
 
 
 @pytest.mark.parametrize("is_remote", [True, False])
-async def test_only_an_actor_on_another_machine_syncs_every_step_by_default(
+async def test_actor_on_another_machine_syncs_every_step_and_has_no_generations(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_remote: bool
 ) -> None:
     stores: list[FolderStore] = []
@@ -39,6 +39,7 @@ async def test_only_an_actor_on_another_machine_syncs_every_step_by_default(
     service = Service(Config(), network, tmp_path, ("optimizer",), is_remote=is_remote)
     service._stage(actor_spec("optimizer"), transport(), {}, asyncio.Lock())
     assert [store.syncs for store in stores] == [is_remote]
+    assert [store.has_generations for store in stores] == [not is_remote]
 
 
 @pytest.mark.parametrize(
