@@ -218,7 +218,8 @@ class Faults:
         self.is_reset_wanted = True
         rng = self._rng
         if rng.random() < 0.6:
-            asyncio.get_running_loop().call_later(rng.uniform(0.0, 0.1), self._kill_soon, "service")
+            victim = rng.choice(["service", self._process()])
+            asyncio.get_running_loop().call_later(rng.uniform(0.0, 0.1), self._kill_soon, victim)
         answer = await self._machine.command("reset")
         self.is_reset_wanted = answer is None or not answer.ok
 
