@@ -90,6 +90,31 @@ def principal_axes(q, sigmas):
 
 
 @triton.jit
+def quaternion_gradient(q, g0, g1, g2):
+    """Convert derivatives from the columns of a rotation to its quaternion of any length.
+
+    The length of the quaternion has no effect, so the radial part of the gradient is removed.
+    """
+    shorten = tl.div_rn(1.0, tl.sqrt_rn(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]))
+    w, x, y, z = q[0] * shorten, q[1] * shorten, q[2] * shorten, q[3] * shorten
+    by_w = x * (g1[2] - g2[1]) + y * (g2[0] - g0[2]) + z * (g0[1] - g1[0])
+    by_x = w * (g1[2] - g2[1]) + y * (g1[0] + g0[1]) + z * (g2[0] + g0[2])
+    by_x = by_x - x * 2.0 * (g1[1] + g2[2])
+    by_y = w * (g2[0] - g0[2]) + x * (g1[0] + g0[1]) + z * (g2[1] + g1[2])
+    by_y = by_y - y * 2.0 * (g0[0] + g2[2])
+    by_z = w * (g0[1] - g1[0]) + x * (g2[0] + g0[2]) + y * (g2[1] + g1[2])
+    by_z = by_z - z * 2.0 * (g0[0] + g1[1])
+    radial = w * by_w + x * by_x + y * by_y + z * by_z
+    twice = shorten * 2.0
+    return (
+        (by_w - w * radial) * twice,
+        (by_x - x * radial) * twice,
+        (by_y - y * radial) * twice,
+        (by_z - z * radial) * twice,
+    )
+
+
+@triton.jit
 def image_covariance(along_u, along_v, low_pass):
     """Return uu, uv and vv of the covariance of a splat, px^2.
 

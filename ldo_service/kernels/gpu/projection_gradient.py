@@ -12,33 +12,9 @@ from .projection import (
     jacobian,
     load_row,
     principal_axes,
+    quaternion_gradient,
     to_camera,
 )
-
-
-@triton.jit
-def quaternion_gradient(q, g0, g1, g2):
-    """Convert derivatives from the columns of a rotation to its quaternion of any length.
-
-    The length of the quaternion has no effect, so the radial part of the gradient is removed.
-    """
-    shorten = tl.div_rn(1.0, tl.sqrt_rn(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]))
-    w, x, y, z = q[0] * shorten, q[1] * shorten, q[2] * shorten, q[3] * shorten
-    by_w = x * (g1[2] - g2[1]) + y * (g2[0] - g0[2]) + z * (g0[1] - g1[0])
-    by_x = w * (g1[2] - g2[1]) + y * (g1[0] + g0[1]) + z * (g2[0] + g0[2])
-    by_x = by_x - x * 2.0 * (g1[1] + g2[2])
-    by_y = w * (g2[0] - g0[2]) + x * (g1[0] + g0[1]) + z * (g2[1] + g1[2])
-    by_y = by_y - y * 2.0 * (g0[0] + g2[2])
-    by_z = w * (g0[1] - g1[0]) + x * (g2[0] + g0[2]) + y * (g2[1] + g1[2])
-    by_z = by_z - z * 2.0 * (g0[0] + g1[1])
-    radial = w * by_w + x * by_x + y * by_y + z * by_z
-    twice = shorten * 2.0
-    return (
-        (by_w - w * radial) * twice,
-        (by_x - x * radial) * twice,
-        (by_y - y * radial) * twice,
-        (by_z - z * radial) * twice,
-    )
 
 
 @triton.jit
@@ -93,7 +69,7 @@ def sums_of_pairs(sums, first, count, BLOCK: tl.constexpr):
 
 @triton.jit
 def covariance_gradient(V, Vx, Vy, Vxx, Vxy, Vyy, covariance, box):
-    """Return the derivatives by the image position (u, v) and by the image covariance.
+    """Return the derivatives with respect to image position (u, v) and image covariance.
 
     Args:
         V: Sum of v = dL/d(ln alpha) over the pixels.
@@ -106,10 +82,9 @@ def covariance_gradient(V, Vx, Vy, Vxx, Vxy, Vyy, covariance, box):
         box: Variance of the box filter of binning, px^2; 0 without binning.
 
     Returns:
-        Derivatives by u and v, and twice those by the entries uu, uv and vv.
+        Derivatives with respect to u and v, and twice those for the entries uu, uv and vv.
     """
-    # K is the inverse of the image covariance S. From ln alpha = ln o - d' K d / 2 follow
-    # dL/dmean = K sum(v d) and 2 dL/dS = K sum(v d d') K.
+    # K is the inverse of the covariance S: dL/dmean = K sum(v d) and 2 dL/dS = K sum(v d d') K.
     uu, uv, vv = covariance
     inverse = tl.div_rn(1.0, uu * vv - uv * uv)
     Kuu, Kuv, Kvv = vv * inverse, 0.0 - uv * inverse, uu * inverse
@@ -130,7 +105,7 @@ def covariance_gradient(V, Vx, Vy, Vxx, Vxy, Vyy, covariance, box):
 
 @triton.jit
 def shape_gradient(q, axes, sigmas, jacobian_rows, along, by_covariance):
-    """Return the derivatives by log scales and quaternion, and by the rows of the Jacobian.
+    """Return the derivatives with respect to log scales, quaternion and rows of the Jacobian.
 
     Args:
         q: Quaternion of any length.
