@@ -9,10 +9,12 @@ import fcntl
 import os
 import random
 import secrets
+import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -314,6 +316,8 @@ class Machine:
             patch.object(stage_module, "Worker", worker),
             patch.object(stage_module, "produce", self.produce),
             patch.object(stage_metrics, "resident_mb", lambda: 0.0),
+            patch.object(stage_metrics, "available_memory_mb", lambda: None),
+            patch.object(shutil, "disk_usage", lambda _: SimpleNamespace(free=1e12)),
         ):
             yield
 
