@@ -2,7 +2,7 @@
 
 Each line shows the time stamp in nanoseconds, the tracking status (OK, WEAK or LOST) and the
 camera position in meters. `T_odom_camera` is continuous except after relocalization. The globally
-consistent pose is `T_map_odom @ T_odom_camera`.
+consistent pose is `T_map_odom.matrix() @ T_odom_camera.matrix()`.
 
 Start `ldo serve` and a camera, such as `ldo publish synthetic:room`, each in its own terminal. Then
 run:

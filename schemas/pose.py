@@ -3,6 +3,7 @@
 from typing import Literal
 
 import msgspec
+import numpy as np
 
 from ldo_service.schemas.message import Message, require_count, require_finite
 
@@ -32,6 +33,20 @@ class Pose(msgspec.Struct, frozen=True):
         norm = sum(q * q for q in self.quaternion) ** 0.5
         if abs(norm - 1.0) > QUATERNION_TOLERANCE:
             raise ValueError(f"quaternion {self.quaternion} has norm {norm:.9g}, must be 1")
+
+    def matrix(self) -> np.ndarray:
+        """Return the transform as a homogeneous matrix, [4, 4] float64.
+
+        Matrices can be multiplied and inverted: `T_map_odom.matrix() @ T_odom_camera.matrix()` is
+        T_map_camera.
+        """
+        w, *v = self.quaternion
+        x, y, z = v
+        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        T = np.eye(4)
+        T[:3, :3] += 2 * (w * cross + cross @ cross)
+        T[:3, 3] = self.translation
+        return T
 
 
 IDENTITY = Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))

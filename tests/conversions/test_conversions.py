@@ -1,11 +1,12 @@
 """Objects and observations of the map as messages."""
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ldo_service.conversions.objects import observations_to_messages
 from ldo_service.conversions.poses import pose_from_message
 from ldo_service.maps.publisher import ObjectPublisher
-from ldo_service.schemas import MapObjects, decode, encode
+from ldo_service.schemas import MapObjects, Pose, decode, encode
 from ldo_service.semantics.object_landmarks import distributions, entropies
 from tests.semantics.scenes import NAMES, SCENE_OBJECTS, LabelledMap, poses
 
@@ -34,3 +35,14 @@ def test_object_and_observation_messages_equal_the_map() -> None:
         assert [one.object for one in sent] == [seen.object for seen in observed.observations]
         assert all(one.keyframe == keyframe for one in sent)
     assert sent[0].box_px == tuple(updates[-1].observations[0].box)
+
+
+def test_matrix_of_a_pose_message_equals_the_internal_pose() -> None:
+    """Programs compose poses as matrices; SciPy is the reference for the rotation."""
+    rng = np.random.default_rng(4)
+    for quaternion in rng.normal(size=(20, 4)):
+        quaternion /= np.linalg.norm(quaternion)
+        pose = Pose(tuple(rng.normal(size=3).tolist()), tuple(quaternion.tolist()))
+        rotation = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
+        np.testing.assert_allclose(pose.matrix()[:3, :3], rotation, atol=1e-14)
+        np.testing.assert_allclose(pose.matrix(), pose_from_message(pose), atol=1e-14)
