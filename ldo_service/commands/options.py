@@ -84,7 +84,9 @@ RecordedOdometry = Annotated[
         "tracker as odometry prior"
     ),
 ]
-MaxFrames = Annotated[int | None, argument(metavar="N", help="stop after N frames")]
+MaxFrames = Annotated[
+    int | None, argument(metavar="N", help="stop after N of the frames that --stride selects")
+]
 Stride = Annotated[int, argument(metavar="N", help="take every N-th frame")]
 HoldOutEvery = Annotated[
     int | None,

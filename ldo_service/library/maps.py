@@ -158,8 +158,8 @@ class Map:
             raise ConfigError(f"threads={threads} must be at least 1, or None for all cores.")
         if labels and self._labels is None:
             raise ConfigError(
-                "the map has no labels, because the run had no detector. Repeat the run with the "
-                "setting detector.model."
+                "the map has no labels, because the run had neither a detector nor a labeller. "
+                "Repeat the run with the setting detector.model or vlm_labeller.model."
             )
         T_camera_map = se3.inverse(_map_pose("T_map_camera", T_map_camera))
         count = threads or os.cpu_count() or 1

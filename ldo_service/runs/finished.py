@@ -106,7 +106,7 @@ class MapFolder:
     def semantics(self) -> SavedSemantics | None:
         """Return the labels of the Gaussians, in the order of `gaussians`.
 
-        Return None if the run had no detector.
+        Return None if the run had neither a detector nor a labeller.
         """
         return self._semantics(len(self.gaussians()))
 

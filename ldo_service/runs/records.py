@@ -197,8 +197,8 @@ def read_objects(folder: Path) -> MapObjects:
     if not path.is_file():
         refuse_state(folder)
         raise DataError(
-            f"{folder} has no {OBJECTS}, because the run had no detector. Repeat `ldo run` with "
-            "detector.model; `ldo models --help` shows how to choose one."
+            f"{folder} has no {OBJECTS}, because the run had neither a detector nor a labeller. "
+            "Repeat `ldo run` with detector.model; `ldo models --help` shows how to choose one."
         )
     try:
         return msgspec.json.decode(path.read_bytes(), type=MapObjects)

@@ -124,7 +124,7 @@ def test_query_without_a_match_names_the_known_labels(
 @pytest.mark.parametrize(
     ("content", "complaint"),
     [
-        (None, "had no detector"),
+        (None, "had neither a detector nor a labeller"),
         (b"{", "does not have the format that `ldo run` writes"),
         (b"\xff\xfe", "does not have the format that `ldo run` writes"),
         (
