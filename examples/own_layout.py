@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ldo_service.datasets import Layout, Sequence, SequenceOptions
+from ldo_service import Camera, Trajectory
+from ldo_service.datasets import Layout, RawFrame, Sequence, SequenceOptions
 from ldo_service.errors import DataError
-from ldo_service.geometry import Camera, RawFrame, Trajectory
 
 NAMES = ("color", "depth_mm", "stamps_ns", "camera")
 

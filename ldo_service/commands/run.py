@@ -295,12 +295,11 @@ def summary_table(summary: dict[str, Any], out: Path) -> Table:
         "Gaussians": f"{summary['gaussians']:,}",
         **({"objects": summary["objects"]} if summary["objects"] else {}),
         "speed": f"{summary['fps']:.1f} FPS ({summary['wall_s']:.1f} s, input included)",
-        "tracker, mapper": " and ".join(
-            f"{summary['stage_ms'][name]['p50']:.1f} ms"
+        "median step": ", ".join(
+            f"{name} {summary['stage_ms'][name]['p50']:.1f} ms"
             for name in ("tracker", "mapper")
             if name in summary["stage_ms"]
-        )
-        + " p50",
+        ),
         "peak memory": f"{summary['peak_rss_mb']:.0f} MB",
     }
     for name, value in rows.items():

@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 from ldo_service.errors import ConfigError, DataError
+from ldo_service.geometry import RawFrame
 from ldo_service.geometry.sequence import Cached, Sequence
 from ldo_service.synthetic import open_synthetic
 
@@ -23,7 +24,15 @@ from .seven_scenes import SevenScenesSequence
 from .stray_scanner import StrayScannerSequence
 from .tum import TumSequence
 
-__all__ = ["Cached", "Layout", "Sequence", "SequenceOptions", "find_layout", "open_sequence"]
+__all__ = [
+    "Cached",
+    "Layout",
+    "RawFrame",
+    "Sequence",
+    "SequenceOptions",
+    "find_layout",
+    "open_sequence",
+]
 
 # Layouts of this package. The first one that matches a path opens it.
 LAYOUTS = (
