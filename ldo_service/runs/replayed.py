@@ -1,10 +1,12 @@
 """Replay of a recording: each recorded actor runs again on its recorded inputs."""
 
+import typing
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import msgspec
 import yaml
@@ -14,6 +16,7 @@ from ldo_service.actors.mapper import Mapper
 from ldo_service.actors.topology import actor_spec
 from ldo_service.config import Config, actor_parameters, config_of
 from ldo_service.errors import ConfigError, DataError
+from ldo_service.gaussians.device_choice import Device
 from ldo_service.kernels.gpu.device import gpu_facts
 from ldo_service.recordings.recording import JournalFile, recorded_actors
 from ldo_service.recordings.replay import ReplayReport, replay
@@ -78,12 +81,26 @@ def _config_of(about: Mapping[str, str]) -> Config:
         DataError: The configuration cannot be read.
     """
     try:
-        return config_of(load_yaml(about.get("config", "")) or {})
+        return config_of(_with_device(load_yaml(about.get("config", "")) or {}))
     except yaml.YAMLError as error:
         raise DataError(
             f"the configuration in the recording cannot be read: {error}. Copy the recording "
             "again, or make a new one."
         ) from error
+
+
+def _with_device(tree: dict[str, Any]) -> dict[str, Any]:
+    """Return recorded settings with `service.device` instead of `inference.providers`.
+
+    Recordings of versions that chose the device by its execution provider can thus be replayed. The
+    first provider decides. A provider that no device has stays, and is then rejected by its name.
+    """
+    providers = tree.get("inference", {}).get("providers") or ["cpu"]
+    if providers[0] not in typing.get_args(Device):
+        return tree
+    inference = {k: v for k, v in tree.get("inference", {}).items() if k != "providers"}
+    service = {"device": providers[0]} | tree.get("service", {})
+    return tree | {"inference": inference, "service": service}
 
 
 def _facts_of(about: Mapping[str, str], kind: str) -> dict[str, str]:

@@ -17,7 +17,7 @@ from ldo_service.actors.topology import GRAPH
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError, DataError, ReplayDiverged
 from ldo_service.recordings import mcap_file
-from ldo_service.runs.replayed import _caveats, open_recording
+from ldo_service.runs.replayed import _caveats, _config_of, open_recording
 from ldo_service.runtime.journal import StepRecord, checksum
 from ldo_service.schemas import CameraRgbd, decode, encode
 from ldo_service.testing import replay_recording
@@ -157,9 +157,17 @@ def test_recording_without_a_gpu_has_a_note_if_the_replay_uses_one(
     assert not _caveats({})  # A recording of an earlier version.
 
 
-def test_earlier_recording_with_execution_providers_is_refused_with_the_new_setting() -> None:
+def test_earlier_recording_with_another_provider_is_refused_with_the_new_setting() -> None:
     with pytest.raises(ConfigError, match=r"inference.providers is now service.device"):
-        _caveats({"config": "inference: {providers: [cpu], threads: 1}"})
+        _caveats({"config": "inference: {providers: [tensorrt, cpu], threads: 1}"})
+
+
+@pytest.mark.parametrize(("providers", "device"), [("[cpu]", "cpu"), ("[cuda, cpu]", "cuda")])
+def test_execution_providers_of_an_earlier_recording_select_the_device(
+    providers: str, device: str
+) -> None:
+    config = _config_of({"config": f"inference: {{providers: {providers}, threads: 3}}"})
+    assert (config.service.device, config.inference.threads) == (device, 3)
 
 
 def test_damaged_facts_about_the_gpu_are_a_data_error() -> None:
