@@ -63,6 +63,8 @@ def test_detections_have_label_box_and_score(model: Path, red_keyframe: Keyframe
         "networks_missing": 0,
         "inferences_failed": 0,
         "boxes": 1,
+        "device_failed": 0,
+        "on_gpu": 0,
     }
 
 

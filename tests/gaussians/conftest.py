@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 
 from ldo_service.datasets import Sequence
-from ldo_service.geometry import RgbdFrame
+from ldo_service.gaussians.densification import DensificationConfig
+from ldo_service.geometry import Camera, RgbdFrame
 
 Posed = tuple[RgbdFrame, np.ndarray]  # Frame and T_world_camera.
+# Few large Gaussians, because Triton's interpreter takes some milliseconds for each pair of a
+# Gaussian and a tile.
+FEW = DensificationConfig(coarsest_px=8, max_contrast=9.0, max_depth_step=9.0)
 
 
 @pytest.fixture
@@ -43,3 +47,15 @@ def halved(frame: RgbdFrame) -> RgbdFrame:
 def labels_of(n: int, seed: int = 0) -> np.ndarray:
     """Return random label rows [n, 32]."""
     return np.random.default_rng(seed).integers(0, 256, (n, 32), np.uint8)
+
+
+def window(frame: RgbdFrame, size: int) -> RgbdFrame:
+    """Return the middle of a frame, size x size pixels."""
+    camera = frame.camera
+    x, y = (camera.width - size) // 2, (camera.height - size) // 2
+    inside = slice(y, y + size), slice(x, x + size)
+    return RgbdFrame(
+        np.ascontiguousarray(frame.color[inside]),
+        np.ascontiguousarray(frame.depth_m[inside]),
+        Camera(size, size, camera.fx, camera.fy, camera.cx - x, camera.cy - y),
+    )

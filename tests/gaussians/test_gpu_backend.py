@@ -13,15 +13,12 @@ from ldo_service.gaussians import (
     TrainingView,
     densify,
 )
-from ldo_service.gaussians.densification import DensificationConfig
-from ldo_service.geometry import Camera, RgbdFrame, se3
-from tests.gaussians.conftest import halved
+from ldo_service.geometry import se3
+from tests.gaussians.conftest import FEW, halved, window
 from tests.kernels.gpu.agreement import check
 from tests.kernels.gpu.scenes import ARRAYS, descent, frame_loss, plane_rendering
 
 CONFIG = GaussianOptimizerConfig(half_share=0.2, usual_reach=500)
-# Few large Gaussians, because the interpreter takes some milliseconds for each pair with a tile.
-FEW = DensificationConfig(coarsest_px=8, max_contrast=9.0, max_depth_step=9.0)
 
 
 @pytest.fixture(autouse=True)
@@ -34,18 +31,6 @@ def _setting(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(frame_loss, "PIXEL_LANES", 4096)
     with np.errstate(all="ignore"):
         yield
-
-
-def window(frame: RgbdFrame, size: int) -> RgbdFrame:
-    """Return the middle of a frame, size x size pixels."""
-    camera = frame.camera
-    x, y = (camera.width - size) // 2, (camera.height - size) // 2
-    inside = slice(y, y + size), slice(x, x + size)
-    return RgbdFrame(
-        np.ascontiguousarray(frame.color[inside]),
-        np.ascontiguousarray(frame.depth_m[inside]),
-        Camera(size, size, camera.fx, camera.fy, camera.cx - x, camera.cy - y),
-    )
 
 
 class Mapping:

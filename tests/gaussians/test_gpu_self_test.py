@@ -12,8 +12,7 @@ from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.gaussians.map_builder_config import MapBuilderConfig
 from ldo_service.kernels.gpu.arrays import HostArray
 from ldo_service.kernels.gpu.device import Gpu
-from tests.gaussians.conftest import halved
-from tests.gaussians.test_gpu_backend import FEW, window
+from tests.gaussians.conftest import FEW, halved, window
 from tests.kernels.gpu.scenes import FilledArrays, descent, frame_loss, plane_rendering
 
 

@@ -24,6 +24,7 @@ if os.environ.get("LDO_ISA") != "baseline":
     # Wider instruction sets fuse products with sums, which the kernels do not.
     pytest.skip(REASON + ", and LDO_ISA=baseline", allow_module_level=True)
 
+from ldo_service.evaluation import device_iteration  # noqa: E402, F401
 from ldo_service.kernels.gpu import descent, frame_loss, plane_rendering  # noqa: E402, F401
 
 MAX_PAIRS = 150

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from ldo_service.errors import DeviceError
-from ldo_service.evaluation import device_iteration
 from ldo_service.evaluation.iteration import bench_camera
 from ldo_service.kernels.gpu.device import Gpu
 from tests.bench import bench_gpu
 from tests.commands.test_cli import ldo
-from tests.kernels.gpu.scenes import ARRAYS, plane_rendering
+from tests.kernels.gpu.scenes import ARRAYS, device_iteration, plane_rendering
 
 GPU = Gpu("interpreter", {"triton": "3.7.1"}, ARRAYS)
 SMALL = ("bench", "render", "--device", "cuda", "--gaussians", "30", "--size", "16x16")
