@@ -97,8 +97,8 @@ class TrackedPose(Message, frozen=True, kw_only=True):
     # support: angle between the poses plus their translation divided by the median depth, rad.
     hypothesis_spread_rad: float = 0.0
     T_base_camera: Pose = IDENTITY  # T_odom_base = T_odom_camera @ inverse(T_base_camera).
-    # 0: T_map_odom leads to the frame of the map. Otherwise, it leads to the frame of the submap
-    # with this number, which is not merged with the map yet.
+    # 0: T_map_odom leads to the frame of the map. Otherwise, it leads to the frame of the
+    # submap with this number, which is not merged with the map yet.
     submap: int = 0
 
     def check(self) -> None:

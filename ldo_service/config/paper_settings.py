@@ -47,8 +47,8 @@ class PaperSettings:
     # Number of successive keyframes without an observation after which `ema_rule: paper` removes a
     # label. This is N_miss (LDO-SLAM paper, III.A).
     label_max_misses: Annotated[int, Meta(ge=1, le=255)] = advanced(5)
-    # Rule that fuses detector and labeller: by their reliabilities (adaptive, as in the LDO-SLAM
-    # paper, III.B), by a fixed weight (fixed), or not at all (detector).
+    # Rule that fuses detector and labeller: by their reliabilities (adaptive), by a fixed weight
+    # (fixed), or not at all (detector). The LDO-SLAM paper has the first one (III.B).
     fusion_rule: Literal["adaptive", "fixed", "detector"] = advanced("adaptive")
     # Constant beta of the adaptive fusion (LDO-SLAM paper, III.B).
     fusion_beta: PositiveFloat = advanced(2.0)

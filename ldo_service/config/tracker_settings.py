@@ -149,9 +149,9 @@ class RelocalizationSettings:
 class SubmapSettings:
     """Submaps that the tracker starts after it was lost."""
 
-    # Number of LOST frames in a row after which the tracker starts a new submap. A LOST frame that
-    # looks different from the LOST frames before it counts as three. Frames of a covered camera do
-    # not count. 0 never starts one.
+    # Number of LOST frames in a row after which the tracker starts a new submap. A LOST
+    # frame that looks different from the LOST frames before it counts as three. Frames of a
+    # covered camera do not count. 0 never starts one.
     start_after_lost_frames: NonNegativeInt = 90
 
 

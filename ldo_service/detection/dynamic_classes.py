@@ -26,8 +26,8 @@ class DynamicClassConfig:
         *("person", "bird", "cat", "dog", "horse", "sheep", "cow", "elephant", "bear", "zebra"),
         *("giraffe", "bicycle", "car", "motorcycle", "bus", "train", "truck", "boat", "airplane"),
     )
-    # Maximum difference in depth between a masked pixel and the object, whose depth is the median
-    # of the middle part of its box. 0.4 m covers a stride or an outstretched arm.
+    # Maximum difference in depth between a masked pixel and the object, whose depth is the
+    # median of the middle part of its box. 0.4 m covers a stride or an outstretched arm.
     reach_m: float = 0.4
 
     def __post_init__(self) -> None:

@@ -14,7 +14,10 @@ from ldo_service.errors import DeviceError, ModelError
 log = logging.getLogger(__name__)
 
 CPU, CUDA = "CPUExecutionProvider", "CUDAExecutionProvider"
-PROVIDERS = {"cuda": CUDA, "openvino": "OpenVINOExecutionProvider"}  # By `service.device`.
+PROVIDERS = {
+    "cuda": CUDA,
+    "openvino": "OpenVINOExecutionProvider",
+}  # Names of onnxruntime.
 # Options of execution providers, so that results do not depend on timing: without TF32, and without
 # a search for the fastest convolution.
 OPTIONS = {CUDA: {"use_tf32": "0", "cudnn_conv_algo_search": "HEURISTIC"}}

@@ -28,9 +28,9 @@ ADAM, WEIGHTS = AdamConfig(), LossWeights()
 LIMITS = ShapeLimits(needle_weight=0.01, max_needle_ratio=1.5, max_sigma_px=4.0)
 COLUMNS = {"position": (0, 3), "scale": (3, 6), "rotation": (6, 10), "opacity": (10, 11)}
 COLUMNS["color"] = (11, 14)
-# Largest differences that rounding explains, relative to the norm of the CPU's values. The largest
-# ones that the interpreter of Triton gave on this scene, compared with all three instruction sets
-# of the CPU, are below a fifth of each limit.
+# Largest differences that rounding explains, relative to the norm of the CPU's values. The
+# largest ones that the interpreter of Triton gave on this scene, compared with all three
+# instruction sets of the CPU, are below a fifth of each limit.
 TOLERANCE = {"loss": 1e-5, "weights": 1e-6, "exposure": 1e-6, "moments": 2e-5, "pose": 1e-5}
 TOLERANCE["step"] = 2e-6
 # Largest fraction of the Gaussians that rounding makes visible on one of the devices alone. None of

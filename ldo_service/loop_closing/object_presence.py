@@ -36,12 +36,13 @@ DEPTH_SIGMAS = 3.0
 # the kitchen and of `synthetic:twins`.
 MAX_THROUGH = 0.1
 MIN_MISSING = 0.3
-# Two objects are at one place if the Bhattacharyya coefficient of their Gaussians is at least
-# MIN_OVERLAP and neither overlaps more with another object. One replaces the other if the KL
-# divergence of their labels is above REPLACED_NATS in both directions: a label that is certain for
-# one object then has at most 5 % in the other. Because `divergence` clamps probabilities at 1e-6,
-# two objects that share a label of 75 % count too if each has a label of 25 % that the other lacks.
-# In maps of `synthetic:twins` with seeds 0 and 1, this holds for 1 of 60 pairs of objects that are
+# Two objects are at one place if the Bhattacharyya coefficient of their Gaussians is at
+# least MIN_OVERLAP and neither overlaps more with another object. One replaces the
+# other if the KL divergence of their labels is above REPLACED_NATS in both directions:
+# a label that is certain for one object then has at most 5 % in the other. Because
+# `divergence` clamps probabilities at 1e-6, two objects that share a label of 75 %
+# count too if each has a label of 25 % that the other lacks. In maps of
+# `synthetic:twins` with seeds 0 and 1, this holds for 1 of 60 pairs of objects that are
 # equal except for their texture.
 MIN_OVERLAP = 0.5
 REPLACED_NATS = 3.0

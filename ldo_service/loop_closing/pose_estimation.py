@@ -133,8 +133,8 @@ class DepthConsistency:
 
     overlap: float  # Fraction of the new surface's points that the old keyframe also measured.
     rmse_m: float  # Root mean square distance of these points along their normals.
-    # Fraction of the new points in the old view that lie in free space, in front of the surface
-    # that the old camera measured.
+    # Fraction of the new points in the old view that lie in free space, in front of the
+    # surface that the old camera measured.
     conflict: float
 
 

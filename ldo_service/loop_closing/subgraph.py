@@ -31,8 +31,8 @@ class SubgraphConfig:
     # A new subgraph begins if the rotation plus parallax between two keyframes exceeds this.
     # Consecutive keyframes are 0.35 rad apart, unless frames were dropped.
     gap_rad: float = 1.5
-    # Number of keyframes of a complete subgraph that are stored for later comparisons, 0.13 MB each
-    # at 640x480. With a larger number, no more loops were found on the sequences kitchen and
+    # Number of keyframes of a complete subgraph that are stored for later comparisons, 0.13 MB
+    # each at 640x480. With a larger number, no more loops were found on the sequences kitchen and
     # `synthetic:flat`.
     kept_views: int = 2
 

@@ -94,8 +94,8 @@ class BoxObservation:
     center_px: np.ndarray  # Center of the box, [2].
     sigma_px: float  # Standard deviation of the center.
     intrinsics: np.ndarray  # fx, fy, cx, cy in pixels, [4].
-    # Factor on the squared residual: exp(-2 H) if the entropy H of the observed classes is high,
-    # else 1.
+    # Factor on the squared residual: exp(-2 H) if the entropy H of the observed classes is
+    # high, else 1.
     weight: float = 1.0
 
 

@@ -22,8 +22,8 @@ class ViewConfig:
     good_side_px: float = 128.0
     # Variance of the Laplacian (gray levels squared) at which the sharpness factor is 0.5.
     sharp: float = 100.0
-    # Factor on the quality of a view whose region touches the border of the image or is seen edge
-    # on.
+    # Factor on the quality of a view whose region touches the border of the image or is seen
+    # edge on.
     min_factor: float = 0.25
 
     def __post_init__(self) -> None:

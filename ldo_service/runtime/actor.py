@@ -79,8 +79,8 @@ class In:
     topic: Topic
     policy: Policy
     has_priority: bool = False  # Take messages of this input before those of other inputs.
-    # False: the actor may finish before the producer of the topic does. Its own final messages do
-    # not depend on the last messages of the topic.
+    # False: the actor may finish before the producer of the topic does. Its own final messages
+    # do not depend on the last messages of the topic.
     needs_final: bool = True
 
     def __post_init__(self) -> None:

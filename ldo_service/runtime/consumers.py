@@ -23,8 +23,8 @@ class Consumer:
     limit: int = 0  # Offset of the first message that exceeds the consumer's window.
     repeated_from: int = -1  # Offset at which the last retransmission began; -1 if there was none.
     repeated_at_s: float = 0.0  # Event-loop time of the last retransmission.
-    # Time of the stage's `RunningClock` at which the window was found full, seconds; None while it
-    # is not full.
+    # Time of the stage's `RunningClock` at which the window was found full, seconds; None while
+    # it is not full.
     shut_since_s: float | None = None
     # Offset after the last message that was sent to a consumer with policy Backlog. This field and
     # the next two are unused for other consumers.

@@ -11,8 +11,8 @@ from ldo_service.transport.flow_control import UnackedMessage
 # Number of newest messages that stay in memory although the log on disk has them.
 # Retransmissions to consumers that are not far behind then need not read the disk.
 MESSAGES_IN_MEMORY = 8
-# Maximum size of handled messages that are retained in memory for the next generation, or on disk
-# for the first one, bytes: some tens of keyframes.
+# Maximum size of handled messages that are retained in memory for the next generation, or on
+# disk for the first one, bytes: some tens of keyframes.
 MAX_RETAINED_BYTES = 64_000_000
 
 

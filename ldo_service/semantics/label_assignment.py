@@ -30,8 +30,8 @@ class AssignmentConfig:
     # Maximum difference between the depth of a Gaussian and the measured depth: delta_z
     # (LDO-SLAM paper, III.A).
     max_depth_gap_m: float = 0.1
-    # `two_sided` accepts a Gaussian only at the measured depth. `one_sided`, the test of the paper,
-    # also accepts a Gaussian in front of the measured surface.
+    # `two_sided` accepts a Gaussian only at the measured depth. `one_sided`, the test of the
+    # paper, also accepts a Gaussian in front of the measured surface.
     depth_test: Literal["two_sided", "one_sided"] = "two_sided"
 
     def __post_init__(self) -> None:

@@ -19,8 +19,8 @@ from ldo_service.transport.keys import expiry_warning
 MAX_ACTORS = 64  # Limit of the stored names, because messages may contain any name.
 COMES_BACK_S = 5.0  # Time for an actor to restart after it was killed at its heartbeat timeout.
 
-# Age in seconds of the last generation of the states, the copy to which the service falls back,
-# above which `HealthCollector.warnings` reports it.
+# Age in seconds of the last generation of the states, the copy to which the service falls
+# back, above which `HealthCollector.warnings` reports it.
 OLD_GENERATION_S = 60.0
 
 Row = tuple[type[CounterMetricFamily] | type[GaugeMetricFamily], str, str]

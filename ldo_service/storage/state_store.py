@@ -109,7 +109,7 @@ class FolderStore:
         self.folder, self.syncs, self.has_generations = folder, syncs, has_generations
         self._saved: dict[str, State] = {}
         self._contents: dict[str, StateContents] = {}  # Current state, by actor.
-        self._kept: dict[str, dict[int, StateContents]] = {}  # By actor and generation.
+        self._kept: dict[str, dict[int, StateContents]] = {}  # Files by actor and generation.
         self._last_file: dict[str, int] = {}  # Number of the last file, by actor.
         # File of the last kept generation, by actor and file of the state that it is a copy of.
         self._copies: dict[str, dict[str, str]] = {}

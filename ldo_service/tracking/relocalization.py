@@ -285,8 +285,8 @@ Nearby = tuple[KeyframeRecord, np.ndarray]
 class KeyframeReuseConfig:
     """Settings of keyframe reuse."""
 
-    # Known keyframes are reused once this many keyframes of any kind have been made; 0: never.
-    # Before that, new keyframes improve the map and cost a few kB each.
+    # Known keyframes are reused once this many keyframes of any kind have been made;
+    # 0: never. Before that, new keyframes improve the map and cost a few kB each.
     after: int = 1500
     # Maximum number of records that a frame is aligned to, the nearest first. Each one takes 8
     # ms at 640x480.

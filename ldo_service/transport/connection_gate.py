@@ -29,8 +29,8 @@ import socket
 import sys
 from collections import Counter
 
-# Time from the start of a connection to the router's answer to the client's certificate, seconds:
-# that of Zenoh. At a delay of 0.5 s, a handshake without losses takes 2 s.
+# Time from the start of a connection to the router's answer to the client's certificate,
+# seconds: that of Zenoh. At a delay of 0.5 s, a handshake without losses takes 2 s.
 HANDSHAKE_S = 10.0
 MAX_UNPROVEN = 64  # Unproven connections; a robot has fewer than ten programs.
 MAX_HANDSHAKES = 4  # Handshakes of one address at a time.

@@ -131,8 +131,8 @@ class OutletPosition(NamedTuple):
     seq: int  # Offset of the next message.
     # Messages that at least one required consumer has not handled; empty if a log has them.
     unhandled: tuple[UnackedMessage, ...] = ()
-    # Offset of the first message that is still needed, if the messages are in a log on disk instead
-    # of in `unhandled`; None without a log.
+    # Offset of the first message that is still needed, if the messages are in a log on disk
+    # instead of in `unhandled`; None without a log.
     logged_from: int | None = None
 
     @property

@@ -13,8 +13,8 @@ class ViewerConfig:
 
     address: str = LOOPBACK  # The window needs no keys: anyone who reaches it can see the map.
     port: int = 8080  # If this port is in use, the next free one is used. 0 uses any free port.
-    # Maximum number of drawn Gaussians, 32 bytes each; those that cover the most area
-    # with the highest opacity are drawn. While a map grows, up to a quarter more are drawn.
+    # Maximum number of drawn Gaussians, 32 bytes each; those that cover the most area with the
+    # highest opacity are drawn. While a map grows, up to a quarter more are drawn.
     max_gaussians: int = 300_000
     # Maximum number of poses of a path, 11 minutes at 30 Hz. A longer path is thinned evenly.
     max_poses: int = 20_000

@@ -76,8 +76,8 @@ OFFICE_OBJECTS: tuple[tuple[Row, ...], ...] = (
         ("trash can", 1, (0.92, 2.3, 0), DOOR),
     ),
 )
-# Rows in the frame of a section of the corridor: origin on the floor in the middle. The walk looks
-# at the door wall, at +y.
+# Rows in the frame of a section of the corridor: origin on the floor in the middle. The walk
+# looks at the door wall, at +y.
 SECTION: tuple[Row, ...] = (
     ("radiator", 0, (0.0, -0.78, 0), BACK),
     ("picture frame", 1, (0.0, -0.85, 1.7), BACK),

@@ -25,8 +25,8 @@ VISIT = np.array(
     ]
 )
 MIRROR = np.array([-1, 1, 1, -1, 1, 1])
-# Stations of the walk: the number of an office, and the direction along x in which the walk goes
-# on. A station with `False` is passed without a visit.
+# Stations of the walk: the number of an office, and the direction along x in which the walk
+# goes on. A station with `False` is passed without a visit.
 STATIONS = (
     (0, 1, True),
     (1, 1, False),
