@@ -22,8 +22,8 @@ PROVIDERS = {
 # a search for the fastest convolution.
 OPTIONS = {CUDA: {"use_tf32": "0", "cudnn_conv_algo_search": "HEURISTIC"}}
 MEMORY = {CUDA: "cuda"}  # Memory to which inputs and outputs are bound, by execution provider.
-# Largest difference between the outputs of GPU and CPU, relative to 1 + |output|. It was chosen
-# without a GPU: it is ten times the rounding of half precision, 1e-3.
+# Largest difference between the outputs of GPU and CPU, relative to 1 + |output|. It was
+# chosen without a GPU: it is ten times the rounding of half precision, 1e-3.
 TOLERANCE = 1e-2
 # Prefix of onnxruntime's error messages.
 _SUGAR = re.compile(r"^\[ONNXRuntimeError\] : \d+ : \w+ : (Load model from .*? failed: ?)?")

@@ -40,8 +40,8 @@ class RegionTrackerConfig:
     # many votes as one label result with confidence 1.
     answer_weight: float = 4.0
     # True: boxes vote for the label of a region. False: labels of boxes are fused per Gaussian
-    # (LDO-SLAM paper, III.B), and only the labeller labels a region. A change of this setting does
-    # not affect the votes of regions that are restored from a checkpoint.
+    # (LDO-SLAM paper, III.B), and only the labeller labels a region. A change of this setting
+    # does not affect the votes of regions that are restored from a checkpoint.
     boxes_vote: bool = True
     # Minimum votes for a label: one box with a score of 0.6, or four with 0.3.
     min_votes: float = 0.35
