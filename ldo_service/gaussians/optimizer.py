@@ -123,9 +123,9 @@ class IterationResult:
 class GaussianOptimizer:
     """Optimizer of Gaussians, exposures and keyframe poses; moments persist between calls.
 
-    The same map, training views and plan give bitwise equal results for any number of threads. If
-    a GPU fails, the CPU runs the current plan again and continues with all later ones. Not
-    thread-safe.
+    A plan is the sequence of keyframes for which `optimize` does one iteration each. The same map,
+    training views and plan give bitwise equal results for any number of threads. If a GPU fails,
+    the CPU runs the current plan again and continues with all later ones. Not thread-safe.
 
     Args:
         config: Settings.

@@ -176,7 +176,7 @@ class KeyframeRecord:
         )
 
     def recorrected(self, change: CorrectionChange) -> "KeyframeRecord":
-        """Return a copy of the record for a new camera correction."""
+        """Return a copy of the record for a new correction of vignetting and depth bias."""
         return replace(self, change=change.after(self.change))
 
     @property
@@ -302,7 +302,7 @@ class KeyframeDatabase:
         return KeyframeDatabase(tuple(records))
 
     def recorrected(self, change: CorrectionChange) -> "KeyframeDatabase":
-        """Return the database with all records converted to a new camera correction."""
+        """Return the database for a new correction of vignetting and depth bias."""
         return replace(self, all=tuple(record.recorrected(change) for record in self.all))
 
     def in_submap(self, submap: int, without: Set[int] = frozenset()) -> tuple[KeyframeRecord, ...]:

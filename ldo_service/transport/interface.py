@@ -128,7 +128,7 @@ class MemoryTransport:
         self._answers[key] = last_values
 
     def query(self, key: str) -> Sequence[tuple[bytes, bytes]]:
-        """Return the parts of the last value of a key; empty if no actor answers queries on it."""
+        """Return header and body of each message of the last value of a key; empty without one."""
         return self._answers[key]() if key in self._answers else ()
 
     def close(self) -> None:

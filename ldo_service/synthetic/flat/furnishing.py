@@ -165,7 +165,7 @@ def placed_in(built: list[SceneObject], frame: Placement) -> list[SceneObject]:
     """Move objects from the frame of their room to the world frame.
 
     Args:
-        built: The objects in the frame of the room, see `built`.
+        built: The objects in the frame of the room, as the function `built` returns them.
         frame: Placement of the room in the world.
     """
     return [
