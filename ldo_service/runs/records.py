@@ -198,7 +198,7 @@ def read_objects(folder: Path) -> MapObjects:
         refuse_state(folder)
         raise DataError(
             f"{folder} has no {OBJECTS}, because the run had neither a detector nor a labeller. "
-            "Repeat `ldo run` with detector.model; `ldo models --help` shows how to choose one."
+            "Repeat `ldo run` with --set detector.model=NAME; docs/detector.md shows how."
         )
     try:
         return msgspec.json.decode(path.read_bytes(), type=MapObjects)
