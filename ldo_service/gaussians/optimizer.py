@@ -203,7 +203,8 @@ class GaussianOptimizer:
         if self._backend.can_fail:
             attempt, poses = PlanAttempt(views, observe), self._poses.snapshot()
             try:
-                losses = self._run(gaussians, attempt, plan, *options, attempt.observe, is_usable)
+                with self._begun(gaussians):
+                    losses = self._iterate(attempt, plan, *options, attempt.observe, is_usable)
             except DeviceError as error:
                 attempt.undo()
                 self._poses.restore(poses)
@@ -211,7 +212,8 @@ class GaussianOptimizer:
             else:
                 attempt.commit()
                 return losses
-        return self._run(gaussians, views, plan, *options, observe, is_usable)
+        with self._begun(gaussians):
+            return self._iterate(views, plan, *options, observe, is_usable)
 
     def _continue_on_cpu(self, error: DeviceError) -> None:
         self._backend, self.device = self._backend.on_cpu(), self.device.failed(error)
@@ -222,29 +224,13 @@ class GaussianOptimizer:
             exc_info=error.__cause__,
         )
 
-    def _run(
-        self,
-        gaussians: GaussianMap,
-        views: Views,
-        plan: Sequence[int],
-        rates: tuple[float, float],
-        fixed: int | None,
-        effort: float,
-        starts_half: bool,
-        observe: Observer | None,
-        is_usable: Callable[[int], bool],
-    ) -> list[ImageLoss]:
-        """Run a plan from `begin` to `end` of the backend; `optimize` describes the arguments.
+    @contextmanager
+    def _begun(self, gaussians: GaussianMap) -> Iterator[None]:
+        """Call `begin` of the backend before a `with` block, and `end` after it.
 
         Raises:
             DeviceError: The device failed. The map and the moments of its Gaussians are unchanged.
         """
-        with self._begun(gaussians):
-            return self._iterate(views, plan, rates, fixed, effort, starts_half, observe, is_usable)
-
-    @contextmanager
-    def _begun(self, gaussians: GaussianMap) -> Iterator[None]:
-        """Call `begin` of the backend before a `with` block, and `end` after it."""
         self._backend.begin(gaussians)
         try:
             yield
