@@ -128,12 +128,14 @@ class Mapper(Actor):
         self._refit = LoopRefit(self._map, self.config.refit)
         self._requests = LabelRequests(self._ordered, self._map)
         self._idle_steps = 0  # Idle steps since the last published changes.
+        self._is_still = False  # True if only label results came since the last corrected label.
         self._checkpoint: dict[str, Any] = {}
         self._repeated = 0
 
     def handle(
         self, message: Keyframe | DetectionBoxes | LabelResult | GraphCorrection | RefineMap
     ) -> Iterator[Output]:
+        self._is_still &= isinstance(message, LabelResult)
         match message:
             case DetectionBoxes():
                 yield from self._take_boxes(message)
@@ -294,14 +296,14 @@ class Mapper(Actor):
     @property
     def idle_after_s(self) -> float:  # type: ignore[override]
         """Time without messages after which idle work starts, seconds."""
-        return super().idle_after_s if self._has_urgent_idle_work() else STILL_AFTER_S
+        return super().idle_after_s if self._is_still or self._has_urgent_work() else STILL_AFTER_S
 
-    def _has_urgent_idle_work(self) -> bool:
+    def _has_urgent_work(self) -> bool:
         can_request = self.has_credit(LABEL_REQUEST) and len(self._requests.queue) > 0
         return can_request or self._refit.has_work()
 
     def has_idle_work(self) -> bool:
-        return self._has_urgent_idle_work() or self._ordered.has_work()
+        return self._has_urgent_work() or self._ordered.has_work()
 
     def on_idle(self) -> Iterator[Output]:
         """Refit the map after corrections, send label requests, and correct late labels."""
@@ -323,6 +325,7 @@ class Mapper(Actor):
 
     def _order_labels(self) -> Iterator[Output]:
         step = self._ordered.step()
+        self._is_still = True
         self._idle_steps += 1
         self._requests.add(step.requests, self._newest[0])
         yield from self._label_requests()

@@ -233,6 +233,15 @@ def test_late_labels_are_corrected_only_when_the_camera_stands_still() -> None:
     late.answer_all()
     assert late.mapper.has_idle_work()
     assert late.mapper.idle_after_s == STILL_AFTER_S
+    late.take(late.mapper.on_idle())
+    assert late.mapper.idle_after_s < STILL_AFTER_S  # The label results that follow do not count.
+    while not late.requests:
+        late.take(late.mapper.on_idle())
+    late.answer_all()
+    assert late.mapper.has_idle_work()
+    assert late.mapper.idle_after_s < STILL_AFTER_S
+    late.map(len(WAY))
+    assert late.mapper.idle_after_s == STILL_AFTER_S
     waiting = Walk()
     waiting.mapper.situation = FlowStatus(credits={LABEL_REQUEST: 0})
     for number in range(5):
