@@ -85,6 +85,34 @@ def finish_order(actors: Iterable[T]) -> list[T]:
     return order
 
 
+def consumers_first(actors: Iterable[T]) -> list[T]:
+    """Return the actors so that each one comes after the consumers of its lossless topics.
+
+    Of two actors that are consumers of each other, the one that the first actors reach earlier
+    comes last.
+
+    Args:
+        actors: The actors, producers first.
+    """
+    actors = list(actors)
+    order: list[T] = []
+    begun: set[str] = set()
+
+    def visit(actor: T) -> None:
+        if actor.name in begun:
+            return
+        begun.add(actor.name)
+        topics = _topics(actor)
+        for consumer in actors:
+            if topics & {port.topic.name for port in lossless(consumer)}:
+                visit(consumer)
+        order.append(actor)
+
+    for actor in actors:
+        visit(actor)
+    return order
+
+
 def _topics(actor: HasPorts) -> set[str]:
     return {port.topic.name for port in actor.outputs}
 

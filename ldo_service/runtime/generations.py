@@ -222,10 +222,10 @@ class GenerationKeeper:
         Args:
             commander: Client of the stages.
             store: Store of the states.
-            actors: Names of the actors, producers first.
+            actors: Names of the actors in the order of `consumers_first`.
         """
         self._commander, self._store = commander, store
-        self._actors = tuple(reversed(actors))
+        self._actors = tuple(actors)
         self._completed = 0  # Last complete generation.
         self._is_confirmed = False  # True if the disk is certain to have this number.
         self._positions: list[str] = []

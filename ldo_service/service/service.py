@@ -34,7 +34,12 @@ from ldo_service.recordings.actor_files import ActorFiles
 from ldo_service.recordings.recorder import Recorder
 from ldo_service.recordings.recording import new_path, prepare_recording
 from ldo_service.runtime import check_graph
-from ldo_service.runtime.actor_graph import consumers_with_backlog, finish_order, lossless_consumers
+from ldo_service.runtime.actor_graph import (
+    consumers_first,
+    consumers_with_backlog,
+    finish_order,
+    lossless_consumers,
+)
 from ldo_service.runtime.control import Control
 from ldo_service.runtime.generations import GenerationKeeper, keep_last
 from ldo_service.runtime.journal import Journal
@@ -215,7 +220,9 @@ class Service:
         if self.only or not self.is_state_kept:
             return None
         store = FolderStore(self.state / "state")
-        return GenerationKeeper(CommandSender(transport), store, self._local_actors)
+        local = self._local_actors
+        actors = [box.name for box in consumers_first(GRAPH) if box.name in local]
+        return GenerationKeeper(CommandSender(transport), store, actors)
 
     def _keep_last_generation(self) -> None:
         """Keep the states of the stopped actors, so that a later power cut loses nothing."""

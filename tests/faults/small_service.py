@@ -21,7 +21,12 @@ from ldo_service.datasets import open_sequence
 from ldo_service.gaussians.visibility import OffloadConfig
 from ldo_service.geometry import RawFrame
 from ldo_service.runtime import Out
-from ldo_service.runtime.actor_graph import consumers_with_backlog, finish_order, lossless_consumers
+from ldo_service.runtime.actor_graph import (
+    consumers_first,
+    consumers_with_backlog,
+    finish_order,
+    lossless_consumers,
+)
 from ldo_service.runtime.generations import GenerationKeeper
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage
@@ -44,6 +49,7 @@ CONFIG = load_config(
     )
 )
 ACTORS = tuple(box.name for box in GRAPH)
+KEPT = tuple(box.name for box in consumers_first(GRAPH))
 
 
 def reduced(raw: RawFrame) -> RawFrame:
@@ -81,7 +87,7 @@ class SmallService:
                 )
             )
         store = FolderStore(folder / "state")
-        self.keeper = GenerationKeeper(CommandSender(transport), store, ACTORS)
+        self.keeper = GenerationKeeper(CommandSender(transport), store, KEPT)
         self._camera = Outlet(Out(CAMERA_RGBD), "camera", 1, transport)
         self._room = open_sequence("synthetic:room")
         self._tasks: Sequence[asyncio.Task[None]] = ()

@@ -60,7 +60,7 @@ class Scene:
         save_consumer(self.store, "mapper", 6)
         save_consumer(self.store, "optimizer", 8)
         self.stages = Stages(self.store)
-        self.keeper = GenerationKeeper(self.stages, self.store, ACTORS)
+        self.keeper = GenerationKeeper(self.stages, self.store, ACTORS[::-1])
 
     def handle_message(self) -> None:
         self.store.save("tracker", {"now": [9]})

@@ -23,7 +23,12 @@ from ldo_service.runtime import process as child_module
 from ldo_service.runtime import stage as stage_module
 from ldo_service.runtime import stage_metrics
 from ldo_service.runtime.actor import Actor
-from ldo_service.runtime.actor_graph import consumers_with_backlog, finish_order, lossless_consumers
+from ldo_service.runtime.actor_graph import (
+    consumers_first,
+    consumers_with_backlog,
+    finish_order,
+    lossless_consumers,
+)
 from ldo_service.runtime.control import Control
 from ldo_service.runtime.generations import GenerationKeeper, keep_last
 from ldo_service.runtime.process import ChildProcess
@@ -177,7 +182,8 @@ class Machine:
                 else:
                     runners.append(self._stage(actor, transport, suspects, children))
             store = FolderStore(self.disk.path / "state")
-            keeper = GenerationKeeper(CommandSender(transport), store, NAMES)
+            kept = [actor.name for actor in consumers_first(GRAPH)]
+            keeper = GenerationKeeper(CommandSender(transport), store, kept)
             keeping = asyncio.create_task(keeper.run())
             self.control = Control(
                 transport,
