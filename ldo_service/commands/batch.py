@@ -109,7 +109,7 @@ def batch(
     max_staged_gb: Annotated[
         float,
         argument(
-            metavar="GB", help="maximum size of all copies of recordings on each machine together"
+            metavar="GB", help="maximum total size of the copies of recordings, for each machine"
         ),
     ] = STAGED_GB,
 ) -> None:

@@ -330,7 +330,7 @@ def pair_by_number(color: dict[int, Path], depth: dict[int, Path], folder: Path)
         folder: Folder of the files, for messages.
 
     Raises:
-        DataError: No color image has the number of a depth image.
+        DataError: No number has both a color image and a depth image.
     """
     numbers = sorted(color.keys() & depth.keys())
     if not numbers:

@@ -72,8 +72,9 @@ def device_times(
         require_equal(got, wanted)
     except DeviceError as error:
         raise DeviceError(
-            f"at {camera.width}x{camera.height} pixels with {n} Gaussians, the results are wrong, "
-            f"so no times are measured: {error}"
+            f"at {camera.width}x{camera.height} pixels with {n} Gaussians, an iteration on the GPU "
+            f"differs from one on the CPU: {error} No times are measured. Map on the CPU "
+            "(`service.device=cpu`), and report the GPU and its driver."
         ) from error
     steps = []
     for make in makers:

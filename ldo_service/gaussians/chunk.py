@@ -90,6 +90,6 @@ def unpack(data: bytes | memoryview) -> Chunk:
         labels = np.ascontiguousarray(planes[:, 4 * ROW :])
     except (zstandard.ZstdError, struct.error, ValueError, MemoryError) as error:
         raise DataError(
-            f"the {len(data)} bytes of a file cannot be decoded as Gaussians: {error}"
+            f"the file of {len(data)} bytes cannot be decoded as Gaussians: {error}"
         ) from error
     return Chunk(anchor, np.cumsum(steps), rows, labels)

@@ -53,9 +53,9 @@ class KeyframeStoreConfig:
 class KeyframeStore:
     """Store of keyframe images in `folder`, including images that the folder contains already.
 
-    If `folder` is None, the store uses a temporary folder and removes it at the end. When the store
-    exceeds its quota, it drops keyframes whose previous and next stored keyframe have the closest
-    ids: they probably show the same surface. If the disk is full, a new keyframe is available only
+    If `folder` is None, the store uses a temporary folder, which it removes when it is closed. When
+    the store exceeds its quota, it drops the keyframe between the two stored keyframes with the
+    closest ids, because these two probably show the same surface. If the disk is full, a new keyframe is available only
     while it is in the cache. The content depends only on the calls, not on time. Not thread-safe.
 
     Attributes:

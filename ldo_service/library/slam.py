@@ -129,12 +129,12 @@ class Slam:
 
         Args:
             color: RGB image, [H, W, 3] uint8.
-            depth: Depth z registered to the color image, [H, W] float32, float64 or uint16 in
-                1/depth_scale meters; 0, NaN or infinity where not measured.
+            depth: Depth z registered to the color image, [H, W] float32, float64 or uint16. Its
+                unit is 1/depth_scale meters; it is 0, NaN or infinity where not measured.
             stamp_ns: Time of the exposure in ns, later than that of the last frame.
             prior: T_odom_camera [4, 4] of another odometry at the time of the exposure, such as
-                that of a phone; None if unknown. Only the motion between two priors is used, as an
-                initial guess, and while tracking is lost.
+                that of a phone; None if unknown. Only the motion between two priors is used: as an
+                initial guess, and in place of tracking while that is lost.
 
         Returns:
             The pose of the frame.
@@ -234,8 +234,8 @@ class Slam:
     def save(self, folder: FilePath, *, overwrite: bool = False) -> Path:
         """Write the folder of a run, as `ldo run` does: docs/run-folder.md.
 
-        The map is that after all iterations of `finish`. Times and frame rate in summary.json count
-        only the steps of this object.
+        The folder contains the map after all iterations of `finish`. Times and frame rate in
+        summary.json count only the steps of this object.
 
         Args:
             folder: The folder; it is created.
@@ -245,7 +245,7 @@ class Slam:
             The folder. `Run.open` reads it, and so do `ldo eval`, `ldo view` and `ldo export`.
 
         Raises:
-            ConfigError: The folder is not empty, or cannot be written.
+            ConfigError: The folder cannot be written, or it has files and `overwrite` is False.
         """
         path = Path(folder).expanduser()
         is_finished = self._is_ending and not self._steps and self._failure is None

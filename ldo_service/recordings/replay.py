@@ -237,7 +237,7 @@ class ReplaySession:
         kinds = {port.topic.name: port.topic.message for port in actor.inputs}
         kind = kinds.get(step.topic)
         if kind is None:
-            raise self._diverged(step, step.topic, "an input", "none")
+            raise self._diverged(step, step.topic, recorded="an input", replayed="none")
         try:
             return decode(body, kind)
         except msgspec.DecodeError as error:

@@ -59,7 +59,7 @@ class ActorThread:
     step_ms: list[float] = field(default_factory=list)
 
     def start(self, message: Message) -> Future[StepOutput]:
-        """Start a step in the thread."""
+        """Start the step for a message in the thread of the actor."""
         return self.thread.submit(self._step, message)
 
     def finish(self) -> Future[StepOutput]:

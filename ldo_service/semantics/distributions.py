@@ -27,8 +27,8 @@ def mean_distributions(labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
     Returns:
         The means. A group has all of its mass on background if its weights are all 0.
 
-    Example: the first Gaussian has all its mass on label 2 and weight 3. The second has half of its
-    mass on label 2 and weight 1.
+    Example: the first Gaussian has weight 3, and all of its mass is on label 2. The second has
+    weight 1, and half of its mass is on label 2.
 
     >>> from ldo_service.semantics.gaussian_labels import new_labels
     >>> labels = new_labels(2)

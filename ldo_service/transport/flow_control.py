@@ -111,8 +111,8 @@ class ProducerHello(msgspec.Struct, frozen=True, array_like=True):
         for start in self.starts.values():
             if not 0 <= start < MAX_SEQ:
                 raise ValueError(
-                    f"hello has the offset {start} of the first message for a consumer, which must "
-                    "be within 0..2^62-1"
+                    f"hello names the offset {start} for the first message of a consumer; an "
+                    "offset must be within 0..2^62-1"
                 )
 
 

@@ -53,7 +53,7 @@ def depth_message(stamp_ns: int, frame_id: str = FRAME, pixels: np.ndarray = DEP
 def small(
     stamps_ns: tuple[int, ...] = (10**9, 2 * 10**9), **topics: str
 ) -> list[tuple[int, str, Any]]:
-    """Return the messages of a camera; `topics` replaces names, and "" leaves out a topic."""
+    """Return the messages of a camera; `topics` gives topics other names, or "" to omit them."""
     names = {"color": COLOR, "depth": DEPTH, "info": COLOR_INFO, **topics}
     messages: list[tuple[int, str, Any]] = [(1, names["info"], info_of(CAMERA))]
     for stamp_ns in stamps_ns:

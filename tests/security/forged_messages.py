@@ -39,7 +39,7 @@ attempt = kept_in(LIES)
 
 
 def outcome_of(*calls: Callable[[], object]) -> str:
-    """Return whether each call is rejected with an LdoError and with little memory."""
+    """Return REFUSED if each call raises LdoError and takes little memory, else what one did."""
     for call in calls:
         tracemalloc.start()
         try:

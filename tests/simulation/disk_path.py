@@ -116,7 +116,7 @@ class DiskPath:
             yield self / name
 
     def glob(self, pattern: str) -> Iterator["DiskPath"]:
-        """Yield the paths that match a pattern of one or more names."""
+        """Yield the paths below this folder that match a pattern such as `*/name`."""
         first, _, rest = pattern.partition("/")
         for name in self.disk.names(self._path) if self.is_dir() else ():
             if fnmatchcase(name, first):

@@ -71,7 +71,7 @@ class TileLists:
         firsts: Index of the first pair of each row before the sort by tile, [N]; undefined for rows
             that are not drawn.
         listed: Row of each pair, [P].
-        reached: Bit mask of the blocks of 4x4 pixels of the tile that each pair reaches, [P].
+        reached: Bit mask of each pair: the blocks of 4x4 pixels that its splat may reach, [P].
         origins: Index of each pair before the sort by tile, [P].
         starts: First pair of each tile, [tiles + 1].
     """

@@ -200,10 +200,10 @@ class HandheldSequence(Sequence):
         return self._motion.poses(self._time_s(index) + shift_s + rows * readout_s)
 
     def depth_row_poses(self, index: int) -> np.ndarray:
-        """Return T_world_camera [H, 4, 4] when the rows of a depth image are measured.
+        """Return T_world_camera [H, 4, 4] for the time at which each row of depth is measured.
 
-        Time-of-flight and stereo cameras measure all rows at the same time. Exact depth and a
-        Kinect's depth have the same shutter as the color camera.
+        Simulated time-of-flight and stereo cameras measure all rows at the same time. Exact depth
+        and that of a Kinect v1 are measured row by row, like the color image.
         """
         if self.config.effects.depth in ("tof", "stereo"):
             time_s = np.full(HEIGHT_PX, self._time_s(index) + self.depth_delay_s)

@@ -88,7 +88,7 @@ def cloud(
     sigma: tuple[float, float] = (0.005, 0.1),
     logit: tuple[float, float] = (-3, 5),
 ) -> np.ndarray:
-    """Return rows in a cone wider than the image; `sigma` is relative to the depth."""
+    """Return random Gaussians inside and beside the image; `sigma` is relative to the depth."""
     rng = np.random.default_rng(seed)
     rows, z = np.zeros((n, 16), np.float32), rng.uniform(*depth_m, n)
     rows[:, :3] = np.column_stack([rng.uniform(-0.8, 0.8, (n, 2)) * np.abs(z[:, None]), z])
