@@ -80,7 +80,7 @@ def update_votes(
 
     The members of a landmark are a sample of its Gaussians. A member in the region of its landmark
     gains a vote, up to 8. A member loses a vote if it is visible outside of this region, or if it
-    was removed from the map or offloaded to disk. A member that has lost all votes gains none again.
+    was removed from the map or offloaded to disk. A member without votes gains none again.
 
     Args:
         votes: Votes before the keyframe, [K, 256].
