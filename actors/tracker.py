@@ -163,6 +163,7 @@ class Tracker(Actor):
         self._made = self._without_room = self._reused = 0
         # Numbers of frames aligned, and of those in which color and depth contradicted each other.
         self._aligned = self._contradictory = 0
+        self._lost = 0  # Consecutive LOST frames up to the last one.
         # Numbers of prior poses by outcome of their check.
         self._prior_checks: Counter[PriorCheck] = Counter()
         # Numbers of frames with and without a prior, since the first pose of the prior.
@@ -225,6 +226,7 @@ class Tracker(Actor):
         self._without_room += result.denied_keyframe is not None and not is_held_out
         self._aligned += result.information.any() and result.status is not TrackingStatus.LOST
         self._contradictory += result.is_contradictory
+        self._lost = self._lost + 1 if result.status is TrackingStatus.LOST else 0
         if not self._prior.poses:
             return
         self._with_prior += result.has_prior
@@ -323,6 +325,7 @@ class Tracker(Actor):
             "frames_aligned": int(self._aligned),
             # Frames in which color and depth contradicted each other.
             "frames_contradictory": self._contradictory,
+            "frames_lost_in_a_row": self._lost,  # 0 while tracking is not lost.
             "frames_with_prior": self._with_prior,
             "frames_without_prior": self._without_prior,  # Since the first pose of the prior.
             "prior_rejected": refused,

@@ -71,7 +71,7 @@ Check = Annotated[
     Literal["service", "calibration", "forecast"],
     tyro.conf.Positional,
     argument(
-        metavar="CHECK",
+        metavar="[CHECK]",
         help="service: this machine and the running service; calibration: the camera of the "
         "finished run DIR; forecast: the growth of the state folder DIR",
     ),
@@ -80,7 +80,8 @@ Folder = Annotated[
     Path | None,
     tyro.conf.Positional,
     argument(
-        metavar="DIR", help="folder of a run for calibration, or of a service's state for forecast"
+        metavar="[DIR]",
+        help="folder of a run for calibration, or of a service's state for forecast",
     ),
 ]
 
@@ -181,15 +182,16 @@ def devices() -> Iterator[Finding]:
     """Report the devices that `service.device=auto` chooses on this machine, and why."""
     defaults = GaussianOptimizerConfig()
     _, choice = choose_backend("auto", defaults.adam, defaults.loss, defaults.limits)
+    mark = "ok" if choice.device == "cuda" else "note"
     yield Finding(
-        "warn" if choice.has_failed else "ok",
+        "warn" if choice.has_failed else mark,
         f"service.device=auto chooses {choice.device} ({choice.name}) for the mapper: "
         f"{choice.reason}",
     )
     on_gpu = providers_of("auto")[0] == CUDA
     device, has = ("cuda", "has") if on_gpu else ("cpu", "lacks")
     yield Finding(
-        "ok",
+        "ok" if on_gpu else "note",
         f"service.device=auto chooses {device} for the networks: the installed onnxruntime {has} "
         f"{CUDA}",
     )

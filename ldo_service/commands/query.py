@@ -116,9 +116,10 @@ def _texts_of(model: str, run: Path | None) -> Encode:
             return open_labeller(model, DualEncoderConfig()).texts.encode(texts)
         had = None if run is None else _labeller_of(run)
         if had is None:
+            what = "the query of a live service" if run is None else "the labeller of this run"
             raise TextComparisonError(
-                "comparing the text with object names needs a text encoder, and the labeller of "
-                "this run has none. Choose a registered encoder pair with `--model NAME`."
+                f"comparing the text with object names needs a text encoder, and {what} has none. "
+                "Choose a registered encoder pair with `--model NAME`."
             )
         try:
             return open_labeller(had.model, had.dual_encoder).texts.encode(texts)

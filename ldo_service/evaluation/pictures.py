@@ -23,14 +23,23 @@ NAMES = "xyz"
 def trajectory_picture(estimate: Trajectory, truth: Trajectory | None) -> np.ndarray:
     """Draw the estimate (blue) and the truth (gray) from above and from the side.
 
-    If at least three poses have a true pose within 20 ms, the estimate is aligned to the truth. The
-    view from above shows the two world axes with the largest extent of the camera motion.
+    If at least three poses have a true pose within 20 ms, the estimate is aligned to the truth, and
+    only the truth of the time of the estimate is drawn. The view from above shows the two world
+    axes with the largest extent of the camera motion.
 
     Returns:
         The picture, RGB [H, W, 3] uint8.
     """
-    lines = [] if truth is None else [_Line(truth.T_world_camera[:, :3, 3], TRUTH, "ground truth")]
-    lines.append(_Line(_aligned_positions(estimate, truth), ESTIMATE, "estimate"))
+    positions = estimate.T_world_camera[:, :3, 3]
+    lines = [_Line(positions, ESTIMATE, "estimate")]
+    if truth is not None:
+        known = truth.T_world_camera[:, :3, 3]
+        pairs = associate(estimate.stamps_s, truth.stamps_s, ASSOCIATION_TOLERANCE_S)
+        if len(pairs) >= MIN_POSES:
+            T = fit_rigid_transform(positions[pairs[:, 0]], known[pairs[:, 1]])
+            lines = [_Line(se3.transform(T, positions), ESTIMATE, "estimate")]
+            known = known[pairs[0, 1] : pairs[-1, 1] + 1]
+        lines.insert(0, _Line(known, TRUTH, "ground truth"))
     lines = [line for line in lines if len(line.points_m)]
     points_m = np.concatenate([line.points_m for line in lines] or [np.zeros((1, 3))])
     short, middle, long = np.argsort(np.ptp(points_m, axis=0), kind="stable")
@@ -133,17 +142,6 @@ class _Line:
     points_m: np.ndarray  # [K, 3].
     color: Color
     name: str
-
-
-def _aligned_positions(estimate: Trajectory, truth: Trajectory | None) -> np.ndarray:
-    positions = estimate.T_world_camera[:, :3, 3]
-    if truth is None:
-        return positions
-    pairs = associate(estimate.stamps_s, truth.stamps_s, ASSOCIATION_TOLERANCE_S)
-    if len(pairs) < MIN_POSES:
-        return positions
-    T = fit_rigid_transform(positions[pairs[:, 0]], truth.T_world_camera[pairs[:, 1], :3, 3])
-    return se3.transform(T, positions)
 
 
 def _view(lines: list[_Line], points_m: np.ndarray, axes: tuple[int, int]) -> np.ndarray:

@@ -213,6 +213,11 @@ def notes(seen: ActorStatus) -> Iterator[str]:
             f"received its last frame {health.step_age_s:.0f} s ago: check the camera if it should "
             "be running"
         )
+    if lost := health.metrics.get("frames_lost_in_a_row"):
+        yield (
+            f"has been LOST for {lost:.0f} frames: turn the camera to a place that it has mapped, in "
+            "good light and without fast motion"
+        )
     if health.metrics.get("networks") == 0 and not health.metrics.get("networks_missing"):
         yield "has no model and detects nothing: set detector.model to one of `ldo models`"
     if due := health.metrics.get("iterations_pending"):

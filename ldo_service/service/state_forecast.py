@@ -35,9 +35,11 @@ def forecast_of_state(folder: Path) -> Forecast:
         folder: State folder of a service.
 
     Raises:
-        DataError: The folder has no keyframe images.
+        DataError: The folder does not exist or has no keyframe images.
         ConfigError: The folder has settings of an earlier version.
     """
+    if not folder.is_dir():
+        raise DataError(f"{folder} is not a folder. Give the folder of `ldo serve --state`.")
     images = sorted((at_s, size_mb) for at_s, size_mb in _files(folder / "map" / "images"))
     if not images:
         raise DataError(

@@ -32,6 +32,13 @@ def test_estimate_covers_the_truth_after_alignment() -> None:
     assert len(pixels_of(picture, TRUTH)) < 0.05 * len(pixels_of(picture, ESTIMATE))
 
 
+def test_only_the_truth_of_the_time_of_the_estimate_is_drawn() -> None:
+    quarter = Trajectory(circle().stamps_s[:25], circle().T_world_camera[:25])
+    above, _ = np.split(trajectory_picture(quarter, circle()), 2, axis=1)
+    # A quarter of the circle fills the picture. It would fill half of that of the whole circle.
+    assert np.ptp(pixels_of(above, ESTIMATE), axis=0).min() > 300
+
+
 def test_pictures_of_other_clocks_and_empty_estimates_are_drawn() -> None:
     late = Trajectory(circle().stamps_s + 1e4, circle().T_world_camera)
     empty = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))

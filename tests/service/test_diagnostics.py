@@ -124,6 +124,7 @@ def test_each_problem_has_its_own_finding(actor: ActorStatus, text: str) -> None
         ),
         (health(metrics={"answers_without_logprobs": 4.0}), "default_confidence"),
         (health(metrics={"frames_rejected": 16.0}), "rejected 16 camera frames"),
+        (health(metrics={"frames_lost_in_a_row": 4.0}), "LOST for 4 frames"),
         (health(metrics={"names_refused": 1.0}), "rejected 1 added names"),
         (health(metrics={"label_copies_dropped": 2.0}), "label results (2 times)"),
         (health(metrics={"iterations_pending": 40.0}), "ldo control refine --iterations 40`"),
