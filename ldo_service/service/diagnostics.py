@@ -215,8 +215,8 @@ def notes(seen: ActorStatus) -> Iterator[str]:
         )
     if lost := health.metrics.get("frames_lost_in_a_row"):
         yield (
-            f"has been LOST for {lost:.0f} frames: turn the camera to a place that it has mapped, in "
-            "good light and without fast motion"
+            f"has been LOST for {lost:.0f} frames: turn the camera to a place that it has mapped, "
+            "in good light and without fast motion"
         )
     if health.metrics.get("networks") == 0 and not health.metrics.get("networks_missing"):
         yield "has no model and detects nothing: set detector.model to one of `ldo models`"
