@@ -18,7 +18,7 @@ MAX_STATIC = 1000  # Maximum number of messages that are read of a topic with co
 
 
 def readable_messages(bag: BagFile, is_wanted: Callable[[Topic], bool]) -> Iterator[Any]:
-    """Yield the readable messages of the wanted topics, from at most MAX_STATIC of each topic."""
+    """Yield the readable ones of the first MAX_STATIC messages of each wanted topic."""
     for topic in filter(is_wanted, bag.topics.values()):
         for message in bag.messages([topic], MAX_STATIC):
             try:

@@ -194,7 +194,8 @@ class GaussianOptimizer:
             observe: Function that is called after each iteration with the keyframe and the visible
                 Gaussians; None for none.
             is_usable: Function that returns whether the map may be fitted to a keyframe now. It is
-                called before each iteration; the iterations of other keyframes are left out.
+                called with the keyframe of each iteration; if it returns False, the iteration is
+                skipped.
 
         Returns:
             Loss before each step, for the iterations that were run.

@@ -218,9 +218,10 @@ def group_to_condense(
     head of a new group.
 
     The keyframe that follows the tail should be measured relative to the tail. If it is measured
-    only relative to keyframes inside the group, these measurements are transferred to the head or
-    the tail. A correction would then move the following keyframe with that variable alone. To avoid
-    this, the group may grow to twice `size`.
+    only relative to keyframes inside the group, condensation transfers these measurements to the
+    head or the tail. In later corrections, the keyframe would follow only that variable. The group
+    is therefore extended, up to twice `size`, until the keyframe after it is measured relative to
+    its tail.
 
     Args:
         active: Keyframes that may still be condensed, ascending (`FactorStore.active`).

@@ -115,7 +115,7 @@ class RestoredState:
 
     @property
     def has_passed(self) -> bool:
-        """True if a message was handled or produced on a lossless topic."""
+        """True if the stage has handled or produced a message of a lossless topic."""
         handled = any(past.handled for past in self.inputs.values())
         return handled or any(past.seq for past in self.outputs.values())
 
