@@ -181,10 +181,9 @@ class Mapper(Actor):
         optimized again with later keyframes, which use it as a neighboring view. The iterations of
         a pending deduplication are subtracted.
         """
-        config = self.config
         return max(
-            config.iterations // (1 + self._waiting()) - self._refit.deduplication_iterations,
-            min(config.min_iterations, config.iterations),
+            self.config.iterations // (1 + self._waiting()) - self._refit.deduplication_iterations,
+            min(self.config.min_iterations, self.config.iterations),
         )
 
     def _waiting(self) -> int:
@@ -296,7 +295,8 @@ class Mapper(Actor):
     @property
     def idle_after_s(self) -> float:  # type: ignore[override]
         """Time without messages after which idle work starts, seconds."""
-        return super().idle_after_s if self._is_still or self._has_urgent_work() else STILL_AFTER_S
+        still_after_s = 0.0 if self._is_still else STILL_AFTER_S
+        return super().idle_after_s if self._has_urgent_work() else still_after_s
 
     def _has_urgent_work(self) -> bool:
         can_request = self.has_credit(LABEL_REQUEST) and len(self._requests.queue) > 0
