@@ -81,8 +81,8 @@ class OffloadedGaussians:
         ids, rows = chunk.ids, chunk.rows
         if len(ids) == 0 or len(ids) != len(rows) or np.any(np.diff(ids) <= 0):
             raise ValueError(
-                f"chunk of anchor keyframe {chunk.anchor}: its {len(ids)} ids must ascend. There "
-                "must be at least one row, and one id per row."
+                f"the chunk of anchor keyframe {chunk.anchor} has {len(rows)} rows and {len(ids)} "
+                "ids. It must have at least one row, one id per row, and ascending ids."
             )
         if self._next_number == 0:
             self._remove_from(0)

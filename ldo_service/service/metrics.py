@@ -199,7 +199,7 @@ class HealthCollector(Collector):
         return sorted({*self._actors} - heard)
 
     def failing_actors(self) -> list[str]:
-        """Return the names of the actors that failed on each of their last messages."""
+        """Return the names of the actors whose heartbeat says `failing`."""
         with self._lock:
             return sorted(actor for actor, (_, health) in self._last.items() if health.failing)
 

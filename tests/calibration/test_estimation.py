@@ -34,7 +34,7 @@ def camera() -> MovingCamera:
 
 
 def recorded(camera: MovingCamera, index: int, timing: ShutterTiming) -> RgbdFrame:
-    """Return a frame with a depth bias, which rolls with the rows of depth."""
+    """Return a frame of a rolling shutter, whose depth has a bias."""
     frame = camera.frame(index / RATE_HZ, timing, index)
     v, u = np.mgrid[: frame.camera.height, : frame.camera.width]
     x, y = (u / (frame.camera.width - 1) - 0.5) * 2, (v - (frame.camera.height - 1) / 2)
