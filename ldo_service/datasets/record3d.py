@@ -220,7 +220,7 @@ def _size(metadata: dict[str, Any], key: str, path: Path) -> int:
     size = number(metadata, key, path)
     if not 1 <= size <= MAX_PIXELS**0.5 or size != int(size):
         raise DataError(
-            f"{path}: {key} of the metadata is {size:g}, must be a number of pixels. Export the "
-            "recording again."
+            f"{path}: {key} of the metadata is {size:g}, expected a whole number of pixels from 1 "
+            f"to {MAX_PIXELS**0.5:.0f}. Export the recording again."
         )
     return int(size)

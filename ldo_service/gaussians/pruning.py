@@ -94,7 +94,7 @@ def weights(rows: np.ndarray) -> np.ndarray:
 
 
 def weightiest(rows: np.ndarray, most: int) -> np.ndarray:
-    """Return the mask [N] bool of the `most` rows of the largest `weights`; all if N <= `most`."""
+    """Return a mask [N] bool of at most `most` rows: those with the largest `weights`."""
     mask = np.ones(len(rows), bool)
     if len(rows) > most:
         mask[np.argsort(weights(rows), kind="stable")[: len(rows) - most]] = False

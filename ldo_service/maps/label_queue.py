@@ -26,11 +26,11 @@ class WaitingRequest(NamedTuple):
 class LabelRequestQueue:
     """Queue of label requests, at most one for each region.
 
-    A labeller that can receive all waiting requests gets the oldest request first. A slower
-    labeller first gets the requests that show the most new surface. The new surface is the area
-    that the view of the request shows, minus the largest area that an earlier request of the same
-    region showed. The rate of requests therefore follows the speed of the labeller, and large
-    objects get their labels first.
+    A request waits until the labeller can receive it. A labeller that can receive all waiting
+    requests gets the oldest request first. A slower labeller first gets the requests that show the
+    most new surface, so large objects get their labels first. The new surface is the area that the
+    view of the request shows, minus the largest area that an earlier request of the same region
+    showed.
     """
 
     def __init__(self) -> None:

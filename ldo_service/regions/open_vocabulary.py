@@ -308,10 +308,10 @@ def match_boxes_to_regions(
 ) -> tuple[Foreground | None, ...]:
     """Return the mask of the region that belongs to each of the detector's boxes.
 
-    `RegionProposal.number` names the box of a region. The mask is a segment by depth and creases if
-    one fits the box, else the foreground of the box from which structural planes are removed.
-    Segments by color ("flat") are not used, because they include the edge of the surface behind the
-    object.
+    `RegionProposal.number` names the box of a region. If a segment found by depth and creases fits
+    the box, the mask is this segment. Otherwise, it is the foreground of the box without structural
+    planes. Segments found by color ("flat") are not used, because they include the edge of the
+    surface behind the object.
 
     Args:
         boxes: Number of boxes.

@@ -61,12 +61,12 @@ class LivePath:
         return len(self._online)
 
     def add(self, pose: TrackedPose, T_map_camera: np.ndarray) -> None:
-        """Add the position of a frame that is not LOST.
+        """Add a frame that is not LOST, with its position as published and as corrected later.
 
         Args:
             pose: Tracked pose of the frame.
-            T_map_camera: Pose of the camera, [4, 4]. Outside submap 0, the published position is
-                stored as unknown.
+            T_map_camera: Pose of the camera as published, [4, 4]. In submaps other than 0, its
+                position is stored as unknown, because it is not in the frame of the map.
         """
         self._heard += 1
         if self._heard % self._every:

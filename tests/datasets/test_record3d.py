@@ -133,7 +133,7 @@ def test_damaged_archive_is_named(path: Path, damage: Callable[[Path], None], me
         ({"K": [1.0, 0, 0, 0, 1, 0, 0, 0, 1]}, "focal length fx=1 px is implausible"),
         ({"perFrameIntrinsicCoeffs": [[50, 50, 30]]}, r"perFrameIntrinsicCoeffs\[0\] of the meta"),
         ({"dw": None}, 'expected a finite number under "dw"'),
-        ({"dh": 1e9}, r"dh of the metadata is 1e\+09, must be a number of pixels"),
+        ({"dh": 1e9}, r"dh of the metadata is 1e\+09, expected a whole number of pixels"),
         ({"h": 64}, r"the images have 64x48 pixels, but the intrinsics are for 64x64"),
         ({"frameTimestamps": [0.0, 0.1, 0.1]}, "the metadata need frameTimestamps"),
         ({"frameTimestamps": None, "fps": 0}, "fps, a positive number"),

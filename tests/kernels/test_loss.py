@@ -45,7 +45,7 @@ def reference_loss(planes: np.ndarray, exposure: np.ndarray, given: dict) -> flo
 
 @pytest.fixture(scope="module")
 def by_kernel(with_isa: Callable) -> dict[str, np.ndarray]:
-    """Return terms and derivatives of every scene by the kernel."""
+    """Return the terms of the loss and their derivatives, computed by the kernel."""
     given = {f"{h}x{w}/{k}": v for h, w in SIZES for k, v in scene(h, w).items()}
     return with_isa(COMPARE_ALL, given)
 

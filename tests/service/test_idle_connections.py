@@ -21,7 +21,7 @@ MAX_FILES = 256  # Limit of open files of the service; systemd sets 1024.
 
 
 class Flood(Thread):
-    """Thread that keeps more connections open than the service may have files."""
+    """Thread that keeps more connections open than the limit of open files of the service."""
 
     def __init__(self, port: int) -> None:
         super().__init__(daemon=True)
