@@ -31,7 +31,7 @@ def commands(text: str) -> Iterator[str]:
 
 
 def inline(text: str) -> Iterator[tuple[str, list[str]]]:
-    """Yield verb and options of each command in a sentence, which may be incomplete."""
+    """Yield verb and options of each command outside shell blocks; it may be incomplete."""
     for verb, rest in INLINE.findall(BLOCK.sub("", text)):
         yield verb, re.findall(r"--[a-z][a-z0-9-]*", rest)
 

@@ -49,7 +49,7 @@ class BenchMap:
 
     The source is tracked once. Its keyframes are then mapped at their final poses on one thread, so
     that measurements with different settings differ by the mapper alone. FPS is the number of
-    frames per CPU second of the mapper. PSNR and depth L1 are errors on every fifth frame, which is
+    frames per CPU second of the mapper. PSNR and depth L1 are those of every fifth frame, which is
     held out; the exposure of such a frame is interpolated between keyframes.
 
     CPU times depend on what else the machine does. For a ratio of two settings, run both commands

@@ -30,7 +30,7 @@ def handle_all(actor, messages: Iterable[Message]) -> list:
 
 
 def without_images(messages: Iterable[Message]) -> list[Message]:
-    """Return the messages, keyframes as the measurements that the optimizer receives."""
+    """Return the messages, with the measurements of each keyframe in place of the keyframe."""
     return [keyframe_measurements_message(m) if isinstance(m, Keyframe) else m for m in messages]
 
 

@@ -345,7 +345,7 @@ def test_surface_mapped_twice_is_deduplicated_after_loop_closure(keyframes) -> N
 
 
 def mapper_after_loop_closure(keyframes, config: MapperConfig) -> Mapper:
-    """Return a mapper of three keyframes, their second round and the loop correction."""
+    """Return a mapper that handled three keyframes, their second round and the loop correction."""
     T_drift = se3.exp(np.array([0, 0.02, 0, 0, 0.1, 0]))
     second = second_round(keyframes[:3], T_drift, first=100)
     poses = {k.keyframe: pose_from_message(k.T_odom_keyframe) for k in keyframes[:3]}

@@ -260,7 +260,7 @@ def label_result(request: LabelRequest, label: str, confidence: float = 0.9) -> 
 
 
 def thing_in_box(request: LabelRequest) -> SceneObject | None:
-    """Return the object with a true box that overlaps most with that of the request."""
+    """Return the object whose true box overlaps most with the box of the request."""
     shot = shoot(SCENE_OBJECTS, WAY[request.keyframe % len(WAY)], request.keyframe)
     best_thing, best_iou = None, 0.5
     for number, thing in enumerate(SCENE_OBJECTS, 1):
@@ -348,7 +348,7 @@ def test_objects_get_their_names_also_when_all_labels_arrive_after_the_walk() ->
 
 
 def test_label_result_applies_to_all_views_of_its_request(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A label that the detector knows is the exception: other views have its own boxes."""
+    """The exception is a label that the detector gives too: the detector labels the other views."""
 
     def labelled(name: str) -> int:
         mapper = Mapper(CONFIG, has_labeller=True)

@@ -113,7 +113,7 @@ def test_an_information_of_zero_does_not_break_the_graph(keyframes) -> None:
 
 # --- submaps -------------------------------------------------------------------------------------
 def in_two_submaps(keyframes: list[Keyframe], split: int) -> list[Keyframe]:
-    """Return keyframes, those from `split` on in a second submap."""
+    """Return the keyframes; keyframe `split` and all later ones are in a second submap."""
     keyframes = with_references_only(keyframes)
     second = msgspec.structs.replace(keyframes[split], submap=1, reference=None)
     later = [

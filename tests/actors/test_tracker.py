@@ -375,7 +375,7 @@ T_PRIOR_WORLD = se3.exp(np.array([0.2, 1.0, -0.3, 4.0, -1.0, 2.0]))
 
 @pytest.fixture(scope="session")
 def frames_with_prior(room: Sequence, frames) -> list[FrameRgbd | OdometryPrior]:
-    """Frames of a fast camera, five of them covered, each after a prior pose of the robot base."""
+    """Frames of a fast camera, some of them covered; a prior pose precedes each frame."""
     truth = room.truth()
     assert truth is not None
     T_camera_base = se3.inverse(T_BASE_CAMERA.matrix())

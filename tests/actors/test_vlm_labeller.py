@@ -83,7 +83,7 @@ def names(tmp_path: Path) -> Path:
 
 
 class FakeLabeller:
-    """Labeller with fixed opinions, which it returns once its gate is open."""
+    """Labeller that returns fixed labels, once its gate is open."""
 
     identity, names = "scripted 1", ("cup",)
 

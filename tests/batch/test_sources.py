@@ -12,7 +12,7 @@ from tests.batch.slices import write_slice
 
 @pytest.fixture
 def night(room_folder: Path, tmp_path: Path) -> Path:
-    """Return a folder with two recordings and a file that is none."""
+    """Return a folder with two recordings and a file of notes, which is no recording."""
     for name in ("a", "b"):
         write_slice(room_folder, tmp_path / "night" / name, 0, 2)
     (tmp_path / "night/notes.txt").touch()

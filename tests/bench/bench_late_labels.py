@@ -52,7 +52,7 @@ SLOW_MESSAGES = {
 
 
 class Run:
-    """Simulated service over a sequence whose named actors are slow while frames arrive."""
+    """Simulated service; the actors in `slowed` are slow while frames arrive."""
 
     def __init__(self, slowed: tuple[str, ...], settings: list[str], folder: Path) -> None:
         config = load_config(settings=(*settings, f"mapper.image_folder={folder}"))

@@ -51,7 +51,7 @@ class Mapped:
 
 @dataclass
 class Tally:
-    """Results of the frames of one source in the map of one source."""
+    """Results of searching for frames of a source among keyframes of the same or another one."""
 
     queries: int = 0
     errors: list[tuple[float, float]] = field(

@@ -59,7 +59,7 @@ def bench_keyframes(source: str, count: int, stride: int, folder: Path) -> None:
 
 
 def bench_offload(source: str, count: int, stride: int, active: int, folder: Path) -> None:
-    """Measure offloading in a map of `active` Gaussians, repeated from the first keyframes."""
+    """Measure offloading in a map of `active` Gaussians, copies of those of `count` keyframes."""
     rows, anchors, poses = mapped(source, count, stride)
     times = -(-active // len(rows))
     gaussians = GaussianMap(active)

@@ -48,7 +48,7 @@ def test_truth_has_the_axes_of_this_project(folder: Path) -> None:
 
 
 def test_published_pose_is_mirrored(tmp_path: Path) -> None:
-    """A camera at y = 1 of ICL-NUIM, which is up, that turns by +90 degrees around z."""
+    """The camera is at y = 1, where y of ICL-NUIM is up, and is turned by +90 degrees around z."""
     folder = write_icl_nuim(tmp_path / "a", FRAMES, POSES)
     half = np.sqrt(0.5)
     (folder / "livingRoom0.gt.freiburg").write_text(f"1 0 1 2 0 0 {half} {half}\n")

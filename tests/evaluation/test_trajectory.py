@@ -138,7 +138,7 @@ def test_errors_of_unsorted_files_agree_with_evo_on_sorted_ones(tmp_path: Path) 
 
 
 def test_each_pose_is_used_once_where_evo_may_use_one_twice() -> None:
-    """Two late poses have the same nearest true pose, because that of the first is missing."""
+    """Two late poses have the same nearest true pose, because one true pose is missing."""
     truth = random_trajectory(3, count=60)
     late = shifted(truth, 0.015)
     with_missing_pose = Trajectory(

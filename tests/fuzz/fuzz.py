@@ -99,7 +99,7 @@ def package_functions() -> list[FunctionType]:
 
 
 def write_finding(error: Exception, body: bytes, out: Path, places: set[str]) -> None:
-    """Write the first body for each place in the code that raises."""
+    """Write the body, unless an earlier body raised this error at the same place in the code."""
     frame = traceback.extract_tb(error.__traceback__)[-1]
     place = f"{type(error).__name__} {frame.filename}:{frame.lineno}"
     if place in places:

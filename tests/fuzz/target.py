@@ -48,7 +48,7 @@ def as_file(name: str, read: Callable[[Path], object]) -> Read:
 
 
 def in_folder(name: str, read: Callable[[Path], object], others: dict[str, bytes]) -> Read:
-    """Return a target function that reads a folder with the file next to valid others."""
+    """Return a target function that reads a folder: its input as file `name`, and `others`."""
 
     def write_and_read(body: bytes, folder: Path) -> object:
         for other, good in {**others, name: body}.items():

@@ -62,7 +62,7 @@ def boxes(height: int, width: int) -> np.ndarray:
 
 
 def plain(height: int, width: int) -> tuple[np.ndarray, SmoothSurfaces]:
-    """Return the depth of the scene and its surfaces by the reference."""
+    """Return the depth of the scene, and the surfaces that the reference implementation finds."""
     depth_m = scene(height, width)
     return depth_m, surfaces_reference(depth_m, camera(height, width), CONFIG)
 

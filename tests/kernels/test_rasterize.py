@@ -67,7 +67,7 @@ SETS = ("baseline", "avx2", "avx512")
 
 @pytest.fixture(scope="module")
 def by_reference() -> dict[str, Rendering]:
-    """Return the rendering of every scene by the reference."""
+    """Return the rendering of every scene, computed by the reference implementation."""
     return {
         name: render_reference(rows.astype(float), camera, T.astype(np.float32).astype(float))
         for name, (rows, camera, T) in SCENES.items()

@@ -62,7 +62,7 @@ SCENES = {
 
 
 def by_planes_of(camera: Camera) -> np.ndarray:
-    """Return random derivatives by the planes, [5, H, W]."""
+    """Return random derivatives with respect to the planes, [5, H, W]."""
     rng = np.random.default_rng(camera.width)
     return rng.normal(size=(5, camera.height, camera.width)).astype(np.float32)
 
@@ -85,7 +85,7 @@ def as_kernel_sees(T: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def by_kernel(with_isa: Callable) -> dict[str, np.ndarray]:
-    """Return planes and gradients of every scene by the kernel."""
+    """Return the planes and gradients of every scene, computed by the kernel."""
     given = {}
     for name, (rows, c, T) in SCENES.items():
         given[f"{name}/rows"], given[f"{name}/T"] = rows, T
@@ -97,7 +97,7 @@ def by_kernel(with_isa: Callable) -> dict[str, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def by_reference() -> dict[str, np.ndarray]:
-    """Return the derivatives of the rows of every scene by the reference."""
+    """Return the derivatives with respect to the rows of every scene, by the reference code."""
     return {
         name: grad(loss)(rows.astype(float), camera, as_kernel_sees(T), binning_of(name))
         for name, (rows, camera, T) in SCENES.items()

@@ -13,7 +13,10 @@ from tests.runtime.fake_actors import Double, Number
 
 
 class IdleTally(Tally):
-    """Tally that adds 1 in each idle step, as often as the last number below 10 says."""
+    """Tally that adds 1 in each idle step.
+
+    A number n below 10 allows n idle steps, and a larger number allows none.
+    """
 
     idle_after_s = 0.001
     lags = True

@@ -33,7 +33,7 @@ def warped(
 
 
 def interpolated(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Interpolate an image at places [H, W], and return which of them mix only valid pixels."""
+    """Return an image interpolated at (x, y) [H, W], and where only valid pixels contribute."""
     height, width = image.shape[:2]
     is_black = (image if image.ndim == 2 else image.max(axis=2)) == 0
     is_inside = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)

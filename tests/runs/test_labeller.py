@@ -20,7 +20,7 @@ QUICK = ("timeout_s=0.2", "max_attempts=1", "max_requests_per_minute=1000000000.
 
 
 def run(sequence: Sequence, folder: Path, server: Server | None, latency: int) -> RunWriter:
-    """Run with a labeller at the server with a latency in frames, or without one."""
+    """Run with a labeller on `server`, whose results take `latency` frames; None is no labeller."""
     settings = [f"offline.latency_frames.vlm_labeller={latency}", "mapper.threads=1"]
     if server:
         settings += [f"vlm_labeller.http.{setting}" for setting in QUICK]

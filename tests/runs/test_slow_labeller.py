@@ -106,7 +106,7 @@ def placed_keyframes(inbox: Heard) -> dict[int, np.ndarray]:
 
 
 def is_reported_late(inbox: Heard) -> bool:
-    """Return whether `ldo doctor` reports the labeller as late, as a note and no problem."""
+    """Return whether `ldo doctor` notes that the labeller is late; this must be no problem."""
     seen = ActorStatus("vlm_labeller", True, inbox.service.update_health()["vlm_labeller"], 1.5)
     assert list(diagnose(seen)) == []
     return any("late" in remark for remark in notes(seen))

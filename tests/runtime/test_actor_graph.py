@@ -89,7 +89,7 @@ def test_final_messages_reach_other_actors_before_these_finish() -> None:
 
 
 def test_input_that_needs_no_final_messages_leaves_the_order() -> None:
-    """The two form a cycle with the final messages, and then the first one finishes first."""
+    """If the input needs them, the actors form a cycle, and the first one listed finishes first."""
     sink = final("sink", [(A, Lossless())], [B])
     source = final("source", [], [A])
     source.inputs = (In(B, Latest(), needs_final=False),)

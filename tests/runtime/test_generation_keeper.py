@@ -137,7 +137,7 @@ async def test_full_disk_completes_no_generation(
 async def test_marker_whose_sync_fails_loses_neither_generation(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A power cut could bring back the old marker until it is written again."""
+    """A power cut could bring back the old marker until a new one is written and synced."""
     await scene.keeper.keep()
     scene.handle_message()
     sync = atomic_write.sync

@@ -193,7 +193,7 @@ async def test_child_is_not_killed_for_time_in_which_its_parent_did_not_run(
     now_s, steps_s = 0.0, iter([1.0] * 5 + [60.0] + [1.0] * 8)
 
     async def sleep(_period_s: float) -> None:
-        """Advance the clock instead of waiting; in one step this process was frozen."""
+        """Advance the clock instead of waiting; a step of 60 s stands for a frozen process."""
         nonlocal now_s
         now_s += next(steps_s)
 

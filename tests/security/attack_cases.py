@@ -54,7 +54,7 @@ def topics(found: list[str]) -> str:
 
 
 def connecting(network: Endpoint) -> str:
-    """Return whether a connection succeeds, or the reason why it fails."""
+    """Return "connected", or NO_CONNECTION with the reason if the error gives one."""
     try:
         with patch.object(zenoh_transport, "CONNECT_WITHIN_MS", 500), open_session(network):
             return "connected"

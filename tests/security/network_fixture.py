@@ -43,7 +43,7 @@ class Lab:
         return Endpoint(ROBOT, self.network.endpoint, TlsKeys(self.folder / name))
 
     def through(self, act: Callable[[], None], *expected: str) -> list[str]:
-        """Return the topics on which messages that `act` puts arrive.
+        """Call `act`, and return the topics on which its messages arrive.
 
         Waits for all `expected` topics, and then for a later message of the service.
         """

@@ -344,7 +344,7 @@ def test_walk_shows_enough_objects_and_bare_walls(exact: FlatSequence) -> None:
 
 @pytest.mark.parametrize("index", [20, 180])
 def test_walls_are_weakly_textured_but_not_flat(exact: FlatSequence, index: int) -> None:
-    """The measure is gray levels about the local mean, away from outlines and shadows."""
+    """The measure is the mean difference from the local gray, away from outlines and shadows."""
     gray = exact.read(index).color.mean(axis=2)
     wall = exact.labels(index).class_ids == CLASS_NAMES.index("wall")
     inner = cv2.erode(wall.astype(np.uint8), np.ones((9, 9))) > 0

@@ -199,8 +199,8 @@ def track_undisturbed(
 ) -> tuple[Outcome, np.ndarray]:
     """Track without a degradation; return the outcome and its alignment T_true_odom.
 
-    Odometry starts at the same pose with a degradation. The same alignment therefore shows what
-    a degradation changed, jumps included.
+    A track with a degradation starts at the same pose, so this alignment also fits it. Its errors
+    then show what the degradation changed, jumps included.
     """
     no_frames = range(count // 3, count // 3)
     steps = track(map(sequence.__getitem__, range(count)), sequence.stamps_ns)

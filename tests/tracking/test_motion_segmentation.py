@@ -228,7 +228,7 @@ def box_around(mask: np.ndarray) -> Box:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_tracking_past_a_person_is_accurate_and_always_ok() -> None:
-    """The ATE is 0.15 cm and 16 frames are WEAK without segmentation."""
+    """The values without segmentation are an ATE of 0.15 cm and 16 frames with status WEAK."""
     sequence = SyntheticSequence.named("person-noisy")
     results = track(sequence)
     T = np.array([r.T_odom_camera for r in results])

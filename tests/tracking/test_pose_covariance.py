@@ -22,7 +22,10 @@ def jacobians(rng: np.random.Generator) -> np.ndarray:
 
 
 def nees_of_sandwich_and_hessian(correlation: float) -> tuple[float, float]:
-    """Return the mean NEES of least squares with noise that is correlated within each cell."""
+    """Return the mean NEES by the sandwich covariance, and by the inverse Hessian alone.
+
+    The noise of the least squares is correlated within each cell.
+    """
     rng = np.random.default_rng(3)
     config = CovarianceConfig(scale=0.5, floor_rad=1e-12, floor_m=1e-12)
     J = jacobians(rng)

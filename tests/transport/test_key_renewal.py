@@ -26,7 +26,7 @@ PREFIX = "ldo/robot"
 
 
 class RunningRouter:
-    """Router behind a gate, which stores the messages that arrive, and its authority."""
+    """Router behind a gate, with its certificate authority and a list of the arrived messages."""
 
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         self.authority = CertificateAuthority.new(folder / "keys", days=60)

@@ -273,7 +273,7 @@ def faults_of(kernel: Kernel, capability: int, made: Compiled) -> list[str]:
 
 
 def specialized_integers(kernel: Kernel) -> list[str]:
-    """Return a fault for each integer argument for whose value Triton would compile again."""
+    """Return an error message for each integer whose value would make Triton compile again."""
     parameters = zip(kernel.function.params, kernel.types, strict=False)
     return [
         f"{kernel.name}: {parameter.name} is missing in SIZES of arithmetic.py"
@@ -283,7 +283,7 @@ def specialized_integers(kernel: Kernel) -> list[str]:
 
 
 def undetected_faults() -> list[str]:
-    """Return a fault for each planted fault that is not detected.
+    """Return an error message for each planted fault that is not detected.
 
     The planted faults are a kernel with too few registers and one with fused products, compiled for
     sm_86, and one whose integers are specialized.

@@ -63,7 +63,7 @@ class Scene:
         return self.T_camera_map.astype(np.float32).astype(float)
 
     def by_planes(self) -> np.ndarray:
-        """Return random derivatives by the planes, [5, H, W]."""
+        """Return random derivatives with respect to the planes, [5, H, W]."""
         rng = np.random.default_rng(self.camera.width)
         return rng.normal(size=(5, self.camera.height, self.camera.width)).astype(np.float32)
 
@@ -107,7 +107,7 @@ def wall(n: int, seed: int, logit: tuple[float, float]) -> np.ndarray:
 
 
 def ties() -> np.ndarray:
-    """Return rows of which sixteen each have equal depths."""
+    """Return rows in three groups of sixteen, which have equal depths within a group."""
     rows = cloud(48, 8, sigma=(0.05, 0.2))
     rows[:, 2] = np.repeat([1.0, 1.5, 2.0], 16)[np.random.default_rng(0).permutation(48)]
     return rows
@@ -186,7 +186,7 @@ def of_kernel(name: str) -> plane_rendering.PlaneRendering:
 
 
 def of_cpu(scene: Scene) -> tuple[Rasterizer, np.ndarray]:
-    """Return the rasterizer in C++ and its planes of a scene."""
+    """Return the C++ rasterizer and the planes that it renders of a scene."""
     rasterizer = Rasterizer()
     planes = rasterizer.render(scene.rows, scene.camera, scene.T_camera_map, binning=scene.binning)
     return rasterizer, planes

@@ -77,7 +77,7 @@ def _fresh_results(monkeypatch: pytest.MonkeyPatch):
 
 
 def changed_module(name: str, text: str, folder: Path) -> ModuleType:
-    """Return a module of kernels with another text, which imports the others unchanged."""
+    """Return a module of kernels whose code is `text`; it imports the other modules unchanged."""
     path = folder / f"changed_{name}.py"
     path.write_text(text)
     full_name = f"ldo_service.kernels.gpu.changed_{name}"
