@@ -8,5 +8,5 @@ import pytest
 
 @pytest.fixture
 def run(finished_run: Path, tmp_path: Path) -> Path:
-    """A copy of the finished run that tests may change."""
+    """A copy of the finished run; tests may change the copy."""
     return shutil.copytree(finished_run, tmp_path / "run")

@@ -59,7 +59,7 @@ def test_culling_changes_no_bit_of_the_images(with_isa: Callable) -> None:
 
 @pytest.mark.parametrize("edge", range(4))
 def test_gaussian_that_slides_out_of_view_is_drawn_as_long_as_a_pixel_shows_it(edge: int) -> None:
-    """Check that the bound excludes the block soon after the image does, and never before."""
+    """Check that the bound excludes the block soon after it leaves the image, never before."""
     axis, sign = divmod(edge, 2)
     drawn, read = [], []
     for step in np.linspace(0, 3, 150):

@@ -110,7 +110,7 @@ def recording(room: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def recording_copy(recording: Path, tmp_path: Path) -> Path:
-    """A copy of the recording that tests may change."""
+    """A copy of the recording; tests may change the copy."""
     for path in recording.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
     return tmp_path

@@ -14,7 +14,7 @@ from ldo_service.storage.state_store import CONTENTS, FolderStore
 
 
 class Files(ChecksummedFolder):
-    """Files of an actor, which retires them as the mapper does."""
+    """Files of an actor that retires its files as the mapper does."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder, "img", "The test fails.")

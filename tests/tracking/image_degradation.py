@@ -187,7 +187,7 @@ def outcome(
 def ok_positions(
     steps: list[Step], T_true: Mapping[int, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """Return estimated and true positions [M, 3] of OK frames with ground truth, and their k."""
+    """Return estimated and true positions [M, 3] and the indices of OK frames with ground truth."""
     evaluated = [s for s in steps if s.is_ok and s.source in T_true]
     p_odom = np.array([s.T_odom_camera[:3, 3] for s in evaluated])
     p_true = np.array([T_true[s.source][:3, 3] for s in evaluated])

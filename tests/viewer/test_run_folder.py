@@ -26,7 +26,7 @@ assert isinstance(EXAMPLE_OBJECTS, MapObjects)
 
 @pytest.fixture
 def run(finished_run: Path, tmp_path: Path) -> Path:
-    """Copy of a finished run that a test may change."""
+    """Copy of a finished run; a test may change the copy."""
     return shutil.copytree(finished_run, tmp_path / "run")
 
 
