@@ -65,7 +65,7 @@ class ModelError(ConfigError):
 
 
 class DeviceError(LdoError):
-    """Device that cannot compute: it is missing, failed, is out of memory, or gives wrong results.
+    """Device that is missing, has failed, has too little memory, or gives wrong results.
 
     Callers continue on the CPU.
     """

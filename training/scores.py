@@ -41,7 +41,7 @@ class ClassScore:
 
     objects: int  # Number of ground-truth objects.
     average_precision: float  # Average precision over all points, at IoU 0.5.
-    recall: float  # Recall of the boxes with at least the score `at` of `detection`.
+    recall: float  # Recall of the boxes with a score of at least `at`, see `detection`.
     precision: float  # Precision of the same boxes.
 
 

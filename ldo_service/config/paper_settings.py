@@ -41,8 +41,8 @@ class PaperSettings:
     ema_rule: Literal["corrected", "paper"] = advanced("corrected")
     # Fraction of its past that the moving average keeps. This is lambda (LDO-SLAM paper, III.A).
     ema_keep_ratio: Annotated[float, Meta(ge=0, lt=1)] = advanced(0.9)
-    # Fraction by which both rules weaken uncertain observations of settled Gaussians. The LDO-SLAM
-    # paper (III.A) has no such factor, which is 0.
+    # Fraction by which both rules weaken uncertain observations of settled Gaussians. 0 reproduces
+    # the LDO-SLAM paper (III.A), where nothing weakens them.
     ema_hold_back_ratio: Ratio = advanced(1.0)
     # Number of successive keyframes without an observation after which `ema_rule: paper` removes a
     # label. This is N_miss (LDO-SLAM paper, III.A).

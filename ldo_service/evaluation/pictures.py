@@ -23,8 +23,8 @@ NAMES = "xyz"
 def trajectory_picture(estimate: Trajectory, truth: Trajectory | None) -> np.ndarray:
     """Draw the estimate (blue) and the truth (gray) from above and from the side.
 
-    If at least three poses have a true pose within 20 ms, the estimate is aligned to the truth, and
-    only the truth of the time of the estimate is drawn. The view from above shows the two world
+    If at least three poses have a true pose within 20 ms, the estimate is aligned to the truth. The
+    truth before and after the estimate is then not drawn. The view from above shows the two world
     axes with the largest extent of the camera motion.
 
     Returns:

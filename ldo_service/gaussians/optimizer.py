@@ -54,7 +54,8 @@ class GaussianOptimizerConfig:
     max_sigma_px: float = 20.0
 
     # Fraction of the computing time after a new keyframe that is spent on iterations at half
-    # resolution, before the others. They improve the map almost as much as the others.
+    # resolution, before those at full resolution. Iterations at half resolution improve the map
+    # almost as much.
     half_share: float = 0.8
     # Number of visible Gaussians at which an iteration is assumed to spend half of its time on the
     # pixels and half on the Gaussians. The effort of an iteration is computed from it.

@@ -22,9 +22,10 @@ class Views(Protocol):
 
 
 class PlanAttempt:
-    """Views and observations of a plan, which can be undone if the device fails.
+    """Access to the views and the observer of a plan that can be undone if the device fails.
 
-    Reads and writes go to the views. The observer receives nothing before `commit`.
+    A changed view is written to `views` immediately, and `undo` restores it. The observer receives
+    nothing before `commit`.
 
     Args:
         views: Training views by keyframe.

@@ -82,7 +82,7 @@ class VisibleGaussians:
 
 
 class Rasterizer:
-    """Renderer for the optimizer, which reuses its memory from image to image.
+    """Renderer for the optimizer; the renderer reuses its memory from image to image.
 
     Its images equal those of `render`, but have no median depth. Not thread-safe.
     """

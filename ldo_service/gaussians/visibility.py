@@ -262,7 +262,8 @@ class OffloadConfig:
     # limit is checked every mapper.publish.update_interval_keyframes keyframes. Until then, new
     # and loaded Gaussians may exceed it.
     max_active: int = 1_500_000
-    # Fraction of max_active that remains in memory after offloading; this takes about 0.1 s.
+    # Fraction of max_active that remains in memory after offloading. One offloading takes about
+    # 0.1 s.
     low_water: float = 0.9
     # Largest distance at which Gaussians count as visible. Depth cameras do not measure this
     # far, so densification does not add surface whose Gaussians are offloaded. Within this

@@ -44,7 +44,8 @@ class PlaneConfig:
     # Maximum difference, 1 / m, between the inverse depth of a plane and of its pixels.
     tolerance: float = 0.006
     # A plane is structural (a wall, floor or ceiling) if a farther surface is visible past less
-    # than this fraction of its outline. None is counted where the image border cuts the plane.
+    # than this fraction of its outline. Where the image border cuts the plane, no farther surface
+    # counts as visible.
     behind: float = 0.3
     # Range of distances outside of the outline in which a farther surface is searched for.
     gap_px: tuple[int, int] = (3, 8)

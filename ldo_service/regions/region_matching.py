@@ -172,8 +172,8 @@ def propagate_mask(
         camera: Intrinsics of both keyframes.
         T_seen_now: Transform from the current camera to the earlier one, [4, 4].
         max_gap_m: Maximum distance of a pixel's point from the nearest point of the earlier
-            observation. If 1.5 times the spacing of the observation's points is larger, that
-            distance is used instead.
+            observation. If 1.5 times the spacing of the observation's points is larger than
+            `max_gap_m`, this larger distance is the maximum instead.
 
     Returns:
         The mask in the current keyframe, or None if fewer than 12 sampled pixels belong to the
@@ -239,7 +239,7 @@ def _enlarged(rows: np.ndarray, columns: np.ndarray, shape: tuple[int, ...]) -> 
 
 
 class RegionMatcher:
-    """Matching of known regions with the regions of one keyframe, given to the constructor."""
+    """Matching of known regions with the regions of the keyframe that the constructor receives."""
 
     def __init__(
         self,

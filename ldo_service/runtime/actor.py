@@ -163,8 +163,8 @@ class Actor:
     lags = False
     # Time without messages after which the stage calls `on_idle`, seconds.
     idle_after_s = 0.2
-    # True if the actor queries an external server, because no journal records the answers of a
-    # server. A replay skips the actor, and feeds its consumers from their own recorded inputs.
+    # True if the actor queries an external server, whose answers no journal records. A replay
+    # therefore skips the actor, and feeds its consumers from their own recorded inputs.
     talks_outside = False
     # True if no other actor waits for the outputs. A step may then take minutes.
     is_backend = False

@@ -88,8 +88,8 @@ def finish_order(actors: Iterable[T]) -> list[T]:
 def consumers_first(actors: Iterable[T]) -> list[T]:
     """Return the actors so that each one comes after the consumers of its lossless topics.
 
-    Of two actors that are consumers of each other, the one that the first actors reach earlier
-    comes last.
+    The order is that of a depth-first search from each actor to its consumers. Of two actors that
+    are consumers of each other, the one that the search visits first comes last.
 
     Args:
         actors: The actors, producers first.

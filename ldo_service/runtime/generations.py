@@ -329,7 +329,7 @@ def keep_stopped(
     Args:
         store: Store of the states.
         actors: The actors.
-        number: Number of the generation, which no earlier one has.
+        number: Number of the generation; no earlier generation has it.
         completed: Number of the last complete generation, which stays whole until this one is
             complete; 0 if there is none.
 

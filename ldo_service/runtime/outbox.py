@@ -151,8 +151,9 @@ class Outbox:
         """Retain the messages that the next generation of the states needs.
 
         The consumers keep their states first (`runtime.generations`). Until this producer keeps its
-        own state, they may handle further messages, which their kept states still need. The outbox
-        therefore retains all messages that were unhandled at the previous call of this method.
+        own state, they may handle further messages, which their kept states still need. The kept
+        states are newer than the previous call of this method. The outbox therefore retains all
+        messages that were unhandled at that call.
 
         Args:
             handled: All consumers have handled the messages before this number.

@@ -141,8 +141,8 @@ class StateSaver:
     ) -> None:
         """Keep the last saved state as a generation, and write it in the background.
 
-        A generation is a copy of all states, to which the service falls back. While one is being
-        written, which takes long on a slow disk, none is begun.
+        A generation is a copy of all states, to which the service can fall back. Writing one takes
+        long on a slow disk. Meanwhile, no other generation is begun.
 
         Args:
             actor: The actor of the stage.

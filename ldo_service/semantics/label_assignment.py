@@ -55,8 +55,8 @@ class Regions:
 
     Attributes:
         boxes: Boxes, [M, 4] float32, x0 y0 x1 y1, pixels.
-        scores: Scores, [M] float32, 0..1. A Gaussian in several regions gets the one with the
-            largest product of overlap and score.
+        scores: Scores, [M] float32, 0..1. A Gaussian in several regions is assigned to the one with
+            the largest product of overlap and score.
         rects: Rectangle of the image that the mask of each region covers: column, row, width and
             height, [M, 4] int32, pixels. Width 0: the region has no mask and is its whole box.
         sums: Summed-area tables [height + 1, width + 1] of the masks, concatenated, [S] int32.

@@ -50,7 +50,7 @@ class StateStore(Protocol):
         """Return the folder for messages that end an actor's process.
 
         Returns:
-            The folder; None if the store is in memory, which does not survive the process either.
+            The folder; None if the store is in memory, because memory is lost with the process.
         """
         ...
 

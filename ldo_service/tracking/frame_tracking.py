@@ -162,7 +162,7 @@ class FrameTracker:
         return self._compensator.motion
 
     def use_knowledge(self, camera: CameraKnowledge) -> None:
-        """Use the uncertainty of the depth bias and the shutter timing for the next frames."""
+        """Use the shutter timing, and how uncertain the depth bias is, for the next frames."""
         align = self.config.align.with_bias(camera.relative_bias_sigma)
         self._compensator.guesses = self._guesses = replace(self._guesses, align=align)
         self.state = self.state.informed(camera, self.config.pyramid, self.config.shutter)

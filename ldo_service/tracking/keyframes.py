@@ -34,11 +34,11 @@ class KeyframeConfig:
     min_frames: int = 1
     # Maximum number of frames between reference keyframes while the camera moves.
     max_frames: int = 30
-    # A frame can become a relay while the caller allows no keyframe: a reference that is used for
-    # tracking but not mapped. It does so if its motion exceeds this multiple of max_rotation_rad or
-    # max_translation, or if its overlap is below min_overlap divided by this ratio. With a ratio of
-    # 1, each held-out frame that needs a keyframe would become a relay. It would then add a link to
-    # the chain of relative poses.
+    # A relay is a reference that is used for tracking but not mapped. A frame can become one while
+    # the caller allows no keyframe. It does so if its motion exceeds this multiple of
+    # max_rotation_rad or max_translation, or if its overlap is below min_overlap divided by this
+    # ratio. With a ratio of 1, each held-out frame that needs a keyframe would become a relay, and
+    # so add a link to the chain of relative poses.
     relay_ratio: float = 1.5
     # The camera stands still if the overlap is above still_overlap, and rotation (rad) and
     # translation (fraction of the median depth) are below still_motion.
@@ -150,8 +150,8 @@ class ReferenceKeyframe:
     def features(self, config: FeatureConfig) -> Features:
         """Return the ORB features.
 
-        The features are detected on the first call and cached, because most keyframes never need
-        any.
+        They are detected on the first call and not earlier, because most keyframes never need any.
+        Later calls return the same features.
         """
         if self.stored_features is not None:
             return self.stored_features

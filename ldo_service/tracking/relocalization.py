@@ -291,7 +291,7 @@ class KeyframeReuseConfig:
     # Maximum number of records that a frame is aligned to, the nearest first. Each one takes 8
     # ms at 640x480.
     tries: int = 2
-    # Maximum rotation plus parallax between the poses by map and by images: 0.03 rad, or 3 % of the
+    # Maximum rotation plus parallax from the predicted to the aligned pose: 0.03 rad, or 3 % of the
     # median depth. Above it, new keyframes are made until a loop closure corrects the map.
     agreement_rad: float = 0.03
     # Minimum inlier fraction of the points paired with a measured depth, as in relocalization.
@@ -318,7 +318,7 @@ class ReusedKeyframe:
     candidate: PoseHypothesis  # Alignment of the frame to the keyframe.
 
     def measurement_of(self, keyframe: int) -> RelativePose:
-        """Return the pose of the aligned frame, the new `keyframe`, relative to this keyframe."""
+        """Return the pose of the aligned frame, which becomes `keyframe`, relative to `record`."""
         seen = self.candidate.alignment
         return RelativePose(self.record.id, keyframe, seen.T_reference_camera, seen.information)
 

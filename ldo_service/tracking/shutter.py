@@ -120,7 +120,7 @@ class ShutterState:
         """Return the motion during a frame with a known pose; None if unknown.
 
         The motion is the mean velocity since the last frame. An extrapolation to the frame would
-        amplify the noise of the poses. The noise would enter the compensation more strongly than
+        amplify the noise of the poses. The noise would affect the compensation more than it affects
         the equations for the timing, and the estimated times would grow without bound.
 
         Args:

@@ -24,8 +24,8 @@ from .pyramid import PyramidConfig
 class WindowConfig:
     """Settings of the measurements of a new keyframe from earlier ones."""
 
-    # Maximum number of measurements per keyframe; 0: none. More change the result little and take
-    # 4 ms each.
+    # Maximum number of measurements per keyframe; 0: none. A larger number changes the result
+    # little, and each measurement takes 4 ms.
     measurements: int = 3
     reach: int = 6  # Number of the last keyframes to try, newest first.
     # Minimum overlap with the older keyframe; a smaller overlap consists mostly of image borders.

@@ -64,7 +64,7 @@ def guarded(network: Endpoint) -> Iterator[tuple[Endpoint, "GateProcess | None"]
 
 
 class GateProcess:
-    """Process of the gate in front of a router, which is started again when it ends."""
+    """Process of the gate in front of a router; the process is started again when it ends."""
 
     def __init__(self, listener: socket.socket, router_port: int) -> None:
         """Start the process.

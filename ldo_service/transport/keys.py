@@ -73,7 +73,7 @@ def _tls(folder: Path, side: str) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class TlsKeys:
-    """Folder with TLS keys, checked when it is created."""
+    """Folder with TLS keys; the constructor checks its files."""
 
     folder: Path
 

@@ -40,7 +40,8 @@ class Placement:
     """Pose of an upright frame in an outer frame, z up in both."""
 
     origin_m: tuple[float, float, float]  # Origin in the outer frame.
-    heading: Heading = (1.0, 0.0)  # x axis of the upright frame as a unit vector (x, y) outside.
+    # x axis of the upright frame as a unit vector (x, y) in the outer frame.
+    heading: Heading = (1.0, 0.0)
 
     def __call__(self, solid: Solid) -> Solid:
         """Transform a solid from the upright frame to the outer frame."""
