@@ -89,7 +89,7 @@ class CameraCorrection:
 
         Args:
             frame: Rectified frame, which is not changed.
-            keeps_clipped: True leaves pixels that may be clipped unchanged, so that the tracker
+            keeps_clipped: True does not change pixels that may be clipped, so that the tracker
                 still recognizes them as clipped. False corrects them too, so that they match their
                 surroundings in the map.
         """

@@ -137,7 +137,7 @@ class SelfCalibration:
         """Return a calibration of a camera whose correction is known from an earlier run.
 
         The correction is used from the first frame on. Its depth bias or its vignetting changes
-        only if held-out views confirm an estimate from the largest number of views.
+        only if held-out views confirm the estimate from max(`config.views`) views.
         """
         calibration = SelfCalibration(config)
         calibration.correction = replace(correction, timing=ShutterTiming())

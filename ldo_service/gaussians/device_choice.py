@@ -40,7 +40,7 @@ class DeviceChoice:
         return replace(on_cpu(f"the GPU {self.name} failed: {error}"), has_failed=True)
 
     def metrics(self) -> dict[str, float]:
-        """Return `device_failed`, which is 1 if the CPU replaces a GPU, and `on_gpu`."""
+        """Return `device_failed` (1 if the CPU replaces a GPU) and `on_gpu` (1 on a GPU)."""
         return {"device_failed": float(self.has_failed), "on_gpu": float(self.device == "cuda")}
 
 

@@ -232,7 +232,7 @@ class Slam:
         return find(self._run.record.placed_objects(), text, self.trajectory().T_world_camera)
 
     def save(self, folder: FilePath, *, overwrite: bool = False) -> Path:
-        """Write the folder of a run, as `ldo run` does: docs/run-folder.md.
+        """Write the folder of a run, as `ldo run` does; see docs/run-folder.md.
 
         The folder contains the map after all iterations of `finish`. Times and frame rate in
         summary.json count only the steps of this object.

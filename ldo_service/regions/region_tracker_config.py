@@ -29,8 +29,8 @@ class RegionTrackerConfig:
     per_keyframe: float = 2.5
     # Maximum label requests at one keyframe, if earlier keyframes made fewer than per_keyframe.
     at_once: int = 4
-    # Factor by which the summed quality of the views must have grown since the last label
-    # request of a region for the next one.
+    # Minimum factor by which the summed quality of a region's views grows between two of its label
+    # requests.
     gain: float = 1.3
     # A label result with at least this confidence, or a box with at least this score, ends the
     # label requests of a region.

@@ -177,8 +177,9 @@ def request_key(region: Region) -> bytes:
 def renumbered(objects: Objects, before: Objects, first_new: int) -> Objects:
     """Return the objects of a `DelayedCopy` with the ids that the map already shows.
 
-    An object that is new in the copy gets the id of the new object in the map with which it has the
-    most Gaussians in common. Each id is given once; without a match, an object gets an unused id.
+    Objects that are new in the copy are matched with objects that are new in the map, so that the
+    matched objects have the most Gaussians in common. A matched object gets the id in the map;
+    another new object gets an unused id.
 
     Args:
         objects: Objects of the copy.

@@ -55,7 +55,7 @@ class Header(msgspec.Struct, frozen=True, array_like=True):
     """
 
     source: str  # Name of the producer.
-    epoch: int  # Positive number of the producer's numbering; it changes when `seq` restarts at 0.
+    epoch: int  # Positive number, which the producer changes when `seq` restarts at 0.
     seq: int  # Offset of the message in this epoch.
     stamp_ns: int  # Stamp of the message.
     key: str = ""  # Value of the field that `Topic.key` names, for `Latest(per_key=True)`.
