@@ -103,7 +103,7 @@ class LoopCloser(Actor):
     is_backend = True
     # Time without messages after which the unfinished subgraph is compared, seconds. A camera that
     # makes no keyframe for this time stands still. Objects of the map are messages too: while the
-    # mapper works idly and publishes them more often than this, the comparison waits.
+    # mapper does idle work and publishes objects more often than this, the comparison waits.
     idle_after_s = 5.0
 
     def __init__(self, config: LoopCloserConfig | None = None) -> None:

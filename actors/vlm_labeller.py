@@ -209,9 +209,9 @@ def labeller_from_config(config: VlmLabellerConfig) -> Labeller | None:
 def require_labeller(config: VlmLabellerConfig) -> None:
     """Check that the configured labeller can be used.
 
-    The server of a labeller is not contacted: this happens at the first label request. An offline
-    run calls this function first, and does not start after an error. A live service starts without
-    a labeller instead.
+    This function does not contact the server of a labeller; the first label request does. An
+    offline run calls this function first, and does not start after an error. A live service starts
+    without a labeller instead.
 
     Raises:
         ConfigError: The labeller cannot be used.

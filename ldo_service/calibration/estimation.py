@@ -87,7 +87,8 @@ class Estimate:
     pairs: list[ViewPair]  # Pairs with their relative poses, estimated jointly with the bias.
     depth_check: HeldOutResiduals  # Residuals of the dense depth alone, without features.
     color_checks: list[HeldOutResiduals]  # One per channel; empty if too few colors were compared.
-    # Error of the pose between depth and color; None if it was not asked for, or not visible.
+    # Error of the pose between depth and color; None if it was not requested, or if the outlines of
+    # surfaces do not determine it.
     extrinsics: Extrinsics | None
 
     @property

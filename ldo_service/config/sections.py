@@ -47,7 +47,7 @@ class Config:
 
         Raises:
             ConfigError: A timeout of the service is too short. Each must be longer than the
-                deadline of a label request plus the time of one attempt, which is the margin.
+                deadline of a label request plus the time of one attempt as margin.
         """
         http = self.vlm_labeller.http
         max_s = http.deadline_s + http.timeout_s  # Deadline of a label, plus one attempt as margin.

@@ -91,7 +91,7 @@ class OptimizerBackend(Protocol):
         ...
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """Return a copy of the moments as named arrays; they do not depend on the backend."""
+        """Return a copy of the moments as named arrays, in a format common to all backends."""
         ...
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:

@@ -241,7 +241,7 @@ def regions_of_image(
     """Return the segments of an image that a labeller could recognize, without near duplicates.
 
     A segment of the kind `standing`, such as a cup, lies inside one of the kind `apart`, such as
-    the table below it. Its pixels are removed from the mask of the segment `apart`.
+    the table below it. The pixels of the cup are then removed from the mask of the table.
 
     Args:
         found: Segments of the image, see `geometric_segmentation`.

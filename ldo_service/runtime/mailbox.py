@@ -251,7 +251,7 @@ class Mailbox:
         """Queue a command; `take` returns it before all deliveries.
 
         A command `keep` replaces earlier commands `keep` in the queue. Otherwise, an actor that was
-        busy for minutes would keep its state once for each of them.
+        busy for minutes would keep its state once for each of these commands.
 
         Args:
             order: The command.

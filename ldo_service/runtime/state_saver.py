@@ -41,7 +41,8 @@ class StateSaver:
     without lossless inputs continue:
 
     - A stage with a nonblocking output (`Out.is_nonblocking`). Messages for required consumers wait
-      until its state is saved, and `Actor.has_credit` is False for them.
+      until the state of the stage is saved. While they wait, `Actor.has_credit` is False for their
+      topics.
     - A stage whose outputs have no required consumer.
 
     A stage that is about to end does not wait for the disk.

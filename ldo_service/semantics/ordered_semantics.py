@@ -166,8 +166,8 @@ class OrderedSemantics:
     def step(self) -> "OrderedStep":
         """Advance the `DelayedCopy` by one label result or one keyframe.
 
-        Label results come before the keyframe after them. After the last keyframe, the copy
-        replaces the live semantics.
+        Label results that are due are used before the next keyframe. After the last keyframe, the
+        copy replaces the live semantics.
         """
         copy, gaussians = self._copy, self._map.gaussians
         assert copy is not None

@@ -55,8 +55,9 @@ class Trend:
     def of(times_s: Sequence[float], values: Sequence[float]) -> "Trend":
         """Fit a line by least squares.
 
-        One step, such as a saved state, does not tell when the next one comes. If one step is more
-        than half of the total change, the slope is therefore that before and after this step.
+        One jump of the values, such as a saved state, does not tell when the next jump comes. If
+        one jump is more than half of the total change, parallel lines are therefore fitted to the
+        values before and after it.
 
         Args:
             times_s: Times of the values, seconds.

@@ -48,7 +48,7 @@ class SavedFiles:
     def sync_unsynced(self) -> None:
         """Sync the files that `check_unsynced` checks, and empty the list of these files.
 
-        A file that the actor removes later then does not count as missing.
+        If the actor removes one of these files afterwards, the file does not count as missing.
 
         Raises:
             OSError: The disk is full, or a file cannot be read.

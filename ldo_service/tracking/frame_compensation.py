@@ -31,7 +31,7 @@ WORSE_OVERLAP, WORSE_NOISE = 0.8, 1.5
 class FrameCompensator:
     """Maker of the image pyramid of a frame, with the camera motion during the frame compensated.
 
-    Between two frames, only a cache is kept.
+    From one frame to the next, it keeps only a cache of the last frame, which `forget` clears.
     """
 
     def __init__(self, config: OdometryConfig, guesses: InitialGuessAligner) -> None:

@@ -42,7 +42,8 @@ class SubmapConfig:
     # default is the field of view of a depth camera. Lower values merge sooner and accept
     # perceptual aliases.
     confirm_apart_rad: float = 1.0
-    misses: int = 3  # Searches in a row without a match after which a pending match still counts.
+    # Maximum number of searches in a row without a match; more of them drop the pending match.
+    misses: int = 3
 
     def __post_init__(self) -> None:
         if self.begin_after_frames < 0 or min(self.search_interval_frames, self.confirm_after) < 1:

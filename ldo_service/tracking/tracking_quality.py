@@ -48,7 +48,7 @@ class TrackingQualityConfig:
     # Maximum gain, and inverse of the minimum gain. A camera that moves into light changes its
     # exposure by about this factor, 1.5 stops.
     max_gain: float = 3.0
-    # The limits named residual are ratios of the noise of an alignment to its running median.
+    # The residual limits below are ratios of the noise of an alignment to its running median.
     weak_residual: float = 2.5  # Maximum ratio of an OK frame.
     lost_residual: float = 5.0  # A frame with a larger ratio is LOST.
     lost_overlap: float = 0.08  # A frame with a smaller overlap is LOST.

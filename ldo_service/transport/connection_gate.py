@@ -84,7 +84,7 @@ class Connection:
             self._gate.wait_for_turn(self)
 
     def from_router(self, data: bytes) -> None:
-        """Pass bytes from the router on to the client, and detect the answer to its certificate."""
+        """Pass bytes from the router to the client; detect its answer to the certificate."""
         if not self._has_router_spoken:
             self._has_router_spoken = HELLO_RETRY not in data[:64]
         elif self._has_client_answered and not self.is_proven:

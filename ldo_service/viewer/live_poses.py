@@ -44,8 +44,8 @@ class LivePath:
     """Positions of the camera, as published and after pose-graph corrections.
 
     A corrected position moves with the reference keyframe of its frame. When there are more than
-    `most` positions, every second one is dropped. From then on, only half as many of the new
-    positions are stored as before.
+    `most` positions, every second one is dropped. From then on, new positions are stored half as
+    often.
     """
 
     def __init__(self, most: int) -> None:

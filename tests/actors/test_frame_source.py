@@ -181,7 +181,7 @@ def test_coarser_depth_is_resampled_to_the_color_image(room: Sequence) -> None:
 
 
 def test_depth_of_a_separate_camera_is_transformed_by_its_extrinsics(room: Sequence) -> None:
-    """The depth image is from a later pose, relative to the color image known exactly."""
+    """The depth image is from a later pose, which is exactly known relative to the color image."""
     truth = room.truth()
     assert truth is not None
     color_index, depth_index = 3, 9

@@ -223,7 +223,7 @@ def test_place_that_matches_two_old_places_is_closed_with_neither(first_walk, ro
 
 
 def test_hypothesis_with_a_wrong_pose_is_rejected(first_walk, second_walk) -> None:
-    """Two keyframes of one place close a loop with their true pose alone."""
+    """Two keyframes of one place close a loop only at their true relative pose."""
     actor, config = LoopCloser(), LoopsConfig()
     handle_all(actor, with_empty_detections([*first_walk, *second_walk]))
     first, *_, last = actor.recognizer.subgraphs

@@ -60,7 +60,7 @@ class Robot:
     process: subprocess.Popen[bytes]
     client: Client
     sent: int = 0
-    since_ns: int = 0  # Earlier frames do not count; they find the rate.
+    since_ns: int = 0  # Earlier frames do not count; they only serve to choose the frame rate.
     poses: int = 0
     judged: int = 0  # Poses that count; judged_ok of them have the status OK.
     judged_ok: int = 0

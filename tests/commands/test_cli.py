@@ -114,7 +114,7 @@ def test_unwritable_folder_is_reported(capsys) -> None:
 
 
 def test_full_disk_is_reported(capsys, tmp_path: Path) -> None:
-    """A limit on the size of files fails a write as a full disk does."""
+    """A limit on the size of files makes a write fail, as a full disk does."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, hard))
     try:

@@ -90,7 +90,7 @@ def test_negative_probe_is_refused(capsys) -> None:
 
 
 def test_topic_chooses_between_two_cameras_of_a_bag(capsys, tmp_path: Path, room: Sequence) -> None:
-    """The commands run and simulate share the option; an error of several topics names it."""
+    """The commands run and simulate share the option; the error about two topics names it."""
     path = two_cameras(tmp_path, room)
     code, _, err = ldo(capsys, "info", path)
     assert code == 3

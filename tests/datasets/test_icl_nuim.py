@@ -39,7 +39,7 @@ def test_frames_are_those_of_the_folder(folder: Path) -> None:
 
 
 def test_truth_has_the_axes_of_this_project(folder: Path) -> None:
-    """A point stays where it is if it is seen from both poses."""
+    """The file has left-handed poses with y up; the reader mirrors the y axis."""
     sequence = open_sequence(str(folder))
     truth = sequence.truth()
     assert truth is not None

@@ -263,7 +263,7 @@ def test_real_networks_detect_furniture_of_the_kitchen(
 def test_real_networks_match_ground_truth_of_the_apartment(
     data: Path, real_detector: OnnxDetector
 ) -> None:
-    """Compare boxes with scores from 0.5 with boxes of the true instances of the class."""
+    """Compare boxes that have a score of at least 0.5 to the true boxes of their class."""
     folder = data / "replica" / "apartment_floor1"
     detections = real_detector.detect(read_color(folder, 100))
     confident = detections.chosen(np.flatnonzero(detections.scores >= 0.5))

@@ -88,9 +88,9 @@ def unlabelled(sequence: Sequence, tmp_path_factory: pytest.TempPathFactory) -> 
 
 @pytest.fixture
 def labelled(unlabelled: Path, sequence: Sequence, tmp_path: Path) -> Path:
-    """Return a copy of the run with the true label of its pixel on each Gaussian.
+    """Return a copy of the run in which each Gaussian has the true label of its pixel.
 
-    Labels have the names of COCO where it has one.
+    A label has its name in COCO, or else its name in the data set.
     """
     folder = shutil.copytree(unlabelled, tmp_path / "run")
     run, names = read_run(folder), Vocabulary()

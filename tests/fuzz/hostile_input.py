@@ -70,7 +70,7 @@ class Generator:
         return encode([source, pick((1, 2, 3, 0, 2**64 - 1)), pick(NUMBERS), self.stamp()])
 
     def stamp(self) -> int:
-        """Return a stamp that mostly goes on, and at times is at or beyond a bound."""
+        """Return a stamp: mostly one that continues the stream, else one at or beyond a bound."""
         self.stamp_ns += self.random.choice((33_000_000, 33_000_000, 33_000_000, 0, 10**8))
         return self.stamp_ns if self.random.random() < 0.9 else self.random.choice(STAMPS)
 

@@ -96,7 +96,7 @@ def test_offloaded_gaussians_return_without_moments(followed: tuple) -> None:
 
 
 def test_gaussians_that_leave_and_return_unseen_lose_their_moments_too(followed: tuple) -> None:
-    """The moments are matched twice between two updates."""
+    """Adam adapts its moments to the map twice between two updates of the mirror."""
     gaussians, adam, mirror = followed
     taken = gaussians.extract(gaussians.anchors == 3)
     adam.steps(gaussians)

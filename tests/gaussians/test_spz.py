@@ -28,7 +28,7 @@ def angles_deg(p: np.ndarray, q: np.ndarray) -> np.ndarray:
 def smallest_three(packed: int) -> list[float]:
     """Return the quaternion wxyz of a packed one.
 
-    Two bits give the largest of xyzw; the others have a sign and nine bits each.
+    Two bits give the index of the largest of xyzw; the others have a sign and nine bits each.
     """
     largest, others = packed >> 30, [packed >> shift & 1023 for shift in (20, 10, 0)]
     values = [(o & 511) / 511 / 2**0.5 * (-1 if o & 512 else 1) for o in others]

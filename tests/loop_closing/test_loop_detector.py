@@ -77,7 +77,7 @@ def test_candidate_that_fails_the_verification_makes_no_other_ambiguous(monkeypa
 
 
 def test_clearly_better_candidate_closes_the_loop(monkeypatch) -> None:
-    """The other candidate has less than half of its inliers, so that only one is ambiguous."""
+    """The worse candidate has less than half of the better one's inliers: only it is ambiguous."""
     found = results(monkeypatch, (20, 60), ("", ""))
     assert reasons_of(found) == ["ambiguous: another place fits as well", ""]
     assert found[1].closure is not None

@@ -138,7 +138,11 @@ def test_object_hidden_in_one_of_two_views_is_tested_in_the_other() -> None:
 
 
 def test_hypothesis_decides_where_the_other_views_look() -> None:
-    """Two places 5 m apart show the same ball, at a pose between them that is 5 m or 5.5 m."""
+    """Two places 5 m apart show equal balls.
+
+    A hypothesis that moves the new place by 5 m finds both balls at one place; with 5.5 m, both are
+    missing.
+    """
     old, new = subgraph(0, depth_of(AHEAD)), subgraph(1, depth_of(AHEAD))
     poses = poses_of(np.eye(4), shift(5.0))
     objects = landmarks(AHEAD, (5.0, 0.0, BALL_M))

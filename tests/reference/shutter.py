@@ -71,7 +71,7 @@ def row_times_s(flow_v: np.ndarray, readout_s: float, delay_s: float, camera: Ca
 
 
 def inverse_depth(depth_m: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Return the inverse depth [height, width] of the cells; that of the median where unknown."""
+    """Return the inverse depth [height, width] of cells; unknown cells have the median depth."""
     sampled = depth_m[CELL_PX // 2 :: CELL_PX, CELL_PX // 2 :: CELL_PX]
     known = np.zeros((height, width), np.float32)
     known[: sampled.shape[0], : sampled.shape[1]] = sampled

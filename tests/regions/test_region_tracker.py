@@ -297,7 +297,8 @@ def test_votes_are_shared_with_overlapping_regions(
 ) -> None:
     """Votes are weighted by the overlap, except for standing regions.
 
-    The upper half of a cabinet is labelled oven, and 0.5 * 0.8**2 is more than 0.5**2.
+    The upper half of a cabinet is labelled oven. The vote for oven, 0.5**2, is less than the vote
+    for cabinet weighted by the overlap, 0.5 * 0.8**2.
     """
     sequence = KeyframeSequence()
     whole, part = proposal(left=40, side=40), upper_rows(rows, kind=kind)

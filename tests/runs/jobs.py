@@ -48,7 +48,7 @@ def quick_submaps() -> Iterator[None]:
 
 
 class Rearranged(Sequence):
-    """Frames of another sequence in another order, at its stamps."""
+    """Frames of another sequence in another order; the stamps stay ascending."""
 
     def __init__(self, sequence: Sequence, order: list[int]) -> None:
         super().__init__(sequence.name, sequence.raw_camera, sequence.stamps_ns[: len(order)])

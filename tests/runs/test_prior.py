@@ -22,7 +22,7 @@ FRAMES, COVERED = 14, range(4, 9)
 
 
 class FastCamera(Cached):
-    """Every third frame at the stamps of the first ones, some black and without depth."""
+    """Every third frame, with the stamps of successive frames; some are black without depth."""
 
     def read(self, index: int) -> RawFrame:
         raw = super().read(3 * index)

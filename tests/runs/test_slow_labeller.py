@@ -35,7 +35,7 @@ PATIENT = (  # Practically no limit.
 
 
 class Walk:
-    """Camera that sends the next frame when the last one is tracked and, as a keyframe, mapped.
+    """Camera that sends a frame when the last one is tracked and, if it is a keyframe, mapped.
 
     The service then receives every frame on any machine, unless an actor waits for the labeller.
     """

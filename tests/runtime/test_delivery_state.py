@@ -271,7 +271,7 @@ async def test_stage_waiting_for_its_disk_is_not_evicted() -> None:
         loop = asyncio.get_running_loop()
 
         def on_grant(_header: bytes, _body: memoryview) -> None:
-            """Check after each credit message, so that a paused process does not count."""
+            """Check for a stall after each credit message: a pause of this process is no stall."""
             loop.call_soon_threadsafe(numbers.evict_stalled, loop.time())
 
         transport.subscribe(credit_key(NUMBERS.name), on_grant)

@@ -177,7 +177,7 @@ def test_retained_messages_that_exceed_the_log_do_not_count_as_dropped(
 def test_message_handled_before_the_first_generation_is_retained(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A consumer that kept its state before it handled the message needs it in that generation."""
+    """A consumer whose kept state is older than the message needs it again in that generation."""
     monkeypatch.setattr(message_log, "SEGMENT_BYTES", 100)
     monkeypatch.setattr("ldo_service.runtime.outbox.MAX_RETAINED_BYTES", 1000)
     logged = {NUMBERS.name: frozenset({"slow"})}

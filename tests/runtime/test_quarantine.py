@@ -117,7 +117,7 @@ async def test_latest_message_is_never_due_because_it_is_not_delivered_again(
 
 
 async def test_suspected_messages_of_a_process_are_handled_one_at_a_time(tmp_path: Path) -> None:
-    """A second count is given to no message except the one that ends the process."""
+    """The message that ends the process is the only one that is counted a second time."""
     for actor in ("guilty", "innocent"):
         await end_process_while_handling(tmp_path / actor, delivery(1))
     suspects = asyncio.Lock()

@@ -52,7 +52,7 @@ with zenoh.open(config) as session:
 
 
 def test_loop_is_closed_while_the_camera_stands_still_and_replays(tmp_path: Path) -> None:
-    """The walk ends where it began; its last keyframes are compared without a stop."""
+    """The walk ends where it began; its last keyframes are compared before the service stops."""
     recording, output = tmp_path / "recording", tmp_path / "subscriber.jsonl"
     settings = ("detector.model=demo", "vlm_labeller.model=demo", "mapper.iterations=4")
     options = [word for setting in settings for word in ("--set", setting)]

@@ -94,7 +94,7 @@ def run(*command: str) -> None:
 
 @pytest.fixture
 def has_netem() -> Iterator[bool]:
-    """Connect two namespaces, and yield whether their network has delay and loss by itself."""
+    """Connect two namespaces, and yield whether the kernel adds delay and loss between them."""
     if os.geteuid() != 0 or not shutil.which("ip"):
         pytest.skip("needs root and ip for network namespaces")
     has_netem = shutil.which("tc") is not None

@@ -104,7 +104,7 @@ def interrupt_write(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
 def test_files_listed_before_a_failed_sync_are_not_overwritten(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A kill can interrupt the next save, which `interrupt_write` simulates."""
+    """The call of `interrupt_write` simulates a kill during the next save."""
     store, folder, same = FolderStore(tmp_path, syncs=True), tmp_path / "mapper", [0]
     store.save("mapper", {"same": same, "step": [1], "old": [1]})
     sync = atomic_write.sync

@@ -19,8 +19,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 def track(frames: Iterable[RgbdFrame], begin_after_frames: int = 0) -> list[TrackingResult]:
     """Track frames; 0 `begin_after_frames` starts no submap.
 
-    The kitchen's camera has a rolling shutter, the apartment's has none. Its compensation is off,
-    because the frames of both are tracked as those of one camera.
+    The kitchen's camera has a rolling shutter, the apartment's has none. The compensation of the
+    shutter is off, because the frames of both are tracked as those of one camera.
     """
     config = OdometryConfig(
         submaps=SubmapConfig(begin_after_frames=begin_after_frames),

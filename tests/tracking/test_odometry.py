@@ -285,7 +285,7 @@ def test_forty_real_frames_stay_within_three_centimeters(data: Path) -> None:
 
 @pytest.mark.parametrize("name", ["lounge_part", "office_part"])
 def test_real_camera_with_large_steps_or_in_a_dim_room_is_not_lost(data: Path, name: str) -> None:
-    """The thresholds were chosen on these sequences, so this test only keeps what was reached."""
+    """The thresholds were chosen on these sequences, so this test only detects a regression."""
     folder = data / "scannet" / name
     if not folder.is_dir():
         pytest.skip(f"LDO_DATA has no scannet/{name}")

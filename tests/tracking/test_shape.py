@@ -71,7 +71,7 @@ def test_gicp_is_bitwise_reproducible(large_room) -> None:
 
 
 def track_white_walls(room, poses: Sequence[np.ndarray]) -> list:
-    """Track frames against the first one; each step to it is large."""
+    """Track frames against the first one, although the motion from it to each frame is large."""
     odometry = Odometry(
         OdometryConfig(keyframes=KeyframeConfig(mapping_only_ratio=2.0, min_frames=30))
     )

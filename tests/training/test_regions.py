@@ -57,7 +57,7 @@ def test_region_has_class_box_and_size_of_its_object(trainer: SimpleNamespace) -
 
 
 def test_region_of_several_objects_has_no_class(trainer: SimpleNamespace) -> None:
-    """Boards that touch are one region, and 0.7 of it has to be one of them."""
+    """Boards that touch form one region. It has a class if one board covers 0.7 of the region."""
     small, large = (CHAIR, 2, 160, 60, 180, 160), (CHAIR, 2, 140, 60, 180, 160)
     (row,) = rows(trainer, (OVEN, 4, 100, 60, 160, 160), small)
     assert row[0] == OVEN
@@ -111,7 +111,7 @@ def test_regions_without_an_object_have_the_configured_frequency(trainer: Simple
 
 
 def test_half_of_a_batch_is_regions(trainer: SimpleNamespace) -> None:
-    """Ovens are in a red frame; the regions, a chair and no object, are in a green one."""
+    """A red frame has two ovens. A green frame has two regions: a chair, and one without object."""
     encoder, views = trainer.encoder, trainer.views
     colors = np.zeros((2, 240, 320, 3), np.uint8)
     colors[0, ..., 0], colors[1, ..., 1] = 200, 200

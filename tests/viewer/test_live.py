@@ -36,7 +36,7 @@ from tests.service.conftest import wait_until
 
 
 class Robot:
-    """Router with the keys of a service that publishes given messages."""
+    """Router that has the keys of a service and publishes given messages."""
 
     def __init__(self, network: Endpoint, session: zenoh.Session) -> None:
         self._network, self._session = network, session
