@@ -187,8 +187,8 @@ def find_containing_regions(
 
     Region a contains region b if three conditions hold: the regions share a class; the gap between
     their depth ranges is at most max_depth_gap_m; and a has the larger box, which covers at least
-    the fraction part_inside of the box of b. A region may have no Gaussian because all of them were
-    assigned to smaller regions inside it. It then gets the depth range of the largest of these.
+    the fraction part_inside of the box of b. If all Gaussians of a region were assigned to smaller
+    regions inside it, the region gets the depth range of the largest of these smaller regions.
 
     Args:
         boxes: Boxes of the regions, [M, 4], x0 y0 x1 y1, pixels.

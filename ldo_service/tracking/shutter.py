@@ -137,8 +137,8 @@ class ShutterState:
     def moved(self, motion: FrameMotion, config: ShutterConfig) -> "ShutterState":
         """Return the state after a frame with a known motion.
 
-        The motion also shows the velocity at the frame before. Only with it can the residuals of
-        that frame (`pending`) become evidence for the times of the shutter.
+        The motion also shows the velocity at the frame before. This velocity is needed before the
+        residuals of that frame (`pending`) can become evidence for the times of the shutter.
         """
         mean, earlier, state = motion.velocity, self.mean_velocity, self
         if earlier is not None:

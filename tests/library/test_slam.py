@@ -141,7 +141,7 @@ def test_objects_and_labels_of_a_run_with_a_detector(tmp_path: Path) -> None:
 
 # --- arguments ------------------------------------------------------------------------------------
 class Exported:
-    """An array of another library, which supports DLPack alone."""
+    """An array of another library that supports only DLPack."""
 
     def __init__(self, array: np.ndarray) -> None:
         self._array = array

@@ -81,7 +81,7 @@ def test_missing_object_or_depth_gives_no_mask() -> None:
 
 
 def test_fewer_than_twelve_samples_give_no_mask() -> None:
-    """The left columns of the disc alone are visible, with a varying number of sampled pixels."""
+    """The visible part of the disc is its left columns, with a varying number of samples."""
     counts = {}
     for columns in range(37, 61, STRIDE_PX):
         now_m, _ = scene(0.0)
