@@ -249,7 +249,7 @@ class Client:
             raise ConfigError(
                 "the map has no objects yet. Objects appear with the first keyframe that a "
                 "detector has processed. They need a detector: start the service with "
-                " `ldo serve --set detector.model=...`; `ldo models` shows how. A service that "
+                "`ldo serve --set detector.model=...`; `ldo models` shows how. A service that "
                 "only localizes publishes no objects; they are in the folder of its map."
             )
         raise self._no_service("replies", MAP_OBJECTS)

@@ -103,7 +103,10 @@ class HeldOutResiduals:
 
     @property
     def residual_ratio(self) -> float:
-        """Residual with the estimated coefficients divided by that without; 1 if that is 0."""
+        """Residual with the estimated coefficients, divided by the residual without them.
+
+        The ratio is 1 if the residual without them is 0.
+        """
         return self.rms_with / self.rms_without if self.rms_without > 0 else 1.0
 
 

@@ -117,8 +117,8 @@ class Estimate:
         relative to the residual without correction:
 
         - up to the limit in `max_ratios`, the new estimate is used;
-        - up to `MAX_KEPT_RATIO`, a correction in use stays in use, with the value of the new
-          estimate or, if it comes from an earlier run, with its own;
+        - up to `MAX_KEPT_RATIO`, a correction in use stays in use: it keeps its value if it comes
+          from an earlier run, and gets the value of the new estimate otherwise;
         - otherwise, the camera is not corrected: the coefficients are 0.
 
         Args:

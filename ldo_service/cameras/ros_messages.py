@@ -175,10 +175,10 @@ def joined(
     """
     if depth.frame_id != color.frame_id and not is_registered:
         raise FrameError(
-            f"depth has frame_id {depth.frame_id!r} and color {color.frame_id!r}. Subscribe to "
-            "depth that is registered to color (realsense2_camera: align_depth.enable:=true; else "
-            "the node `register` of depth_image_proc), or give --registered if this depth is "
-            "already registered."
+            f"depth has frame_id {depth.frame_id!r} and color {color.frame_id!r}, expected equal "
+            "ones. Subscribe to depth that is registered to color (realsense2_camera: "
+            "align_depth.enable:=true; other cameras: the node `register` of depth_image_proc). If "
+            "this depth is already registered, give --registered."
         )
     if (color.image.width, color.image.height) != (camera.width, camera.height):
         raise FrameError(

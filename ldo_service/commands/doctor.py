@@ -271,8 +271,8 @@ def seen(
         window_s: Duration, seconds.
 
     Returns:
-        The status of every actor, and by actor the arrival time in seconds of each heartbeat, and
-        the heartbeat.
+        The status of every actor. Then, by actor, a list of the heartbeats, each with its arrival
+        time in seconds.
 
     Raises:
         ConfigError: No router answers on the endpoint.

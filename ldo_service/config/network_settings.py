@@ -113,7 +113,7 @@ class HttpSettings:
         if self.deadline_s < self.timeout_s:
             raise ConfigError(
                 f"vlm_labeller.http.deadline_s={self.deadline_s:g} must be at least "
-                f"vlm_labeller.http.timeout_s={self.timeout_s:g}, which one attempt may take."
+                f"vlm_labeller.http.timeout_s={self.timeout_s:g}, the time limit of one attempt."
             )
 
 

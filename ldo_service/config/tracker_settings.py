@@ -190,7 +190,8 @@ class QualitySettings:
 class DynamicsSettings:
     """Motion segmentation."""
 
-    # True masks moving surfaces in tracking and in the map. False assumes a static world.
+    # If True, moving surfaces are masked in tracking and in the map. If False, the world is assumed
+    # to be static.
     enabled: bool = True
 
 

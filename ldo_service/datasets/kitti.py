@@ -67,8 +67,8 @@ class KittiSequence(Sequence):
         last = int(self._files.numbers[-1])
         if last >= len(times_ns):
             raise DataError(
-                f"{folder / 'times.txt'} has {len(times_ns)} lines, but there is an image of "
-                f"number {last}. Download the file again."
+                f"{folder / 'times.txt'} has {len(times_ns)} lines, expected at least {last + 1}, "
+                f"because the last image has the number {last}. Download the file again."
             )
         super().__init__(name_of(folder), self._stereo.camera, times_ns[self._files.numbers])
         self._matchers = local()  # One per thread, because a matcher has buffers.
@@ -107,8 +107,8 @@ class KittiSequence(Sequence):
         numbers = self._files.numbers
         if numbers[-1] >= len(poses):
             raise DataError(
-                f"{path} has {len(poses)} lines, but there is an image of number {numbers[-1]}. "
-                "Download the file again."
+                f"{path} has {len(poses)} lines, expected at least {numbers[-1] + 1}, because the "
+                f"last image has the number {numbers[-1]}. Download the file again."
             )
         T_world_camera = poses[numbers] @ self._stereo.T_camera0_camera
         return Trajectory(self.stamps_ns / 1e9, T_world_camera)

@@ -6,9 +6,9 @@ from ldo_service.storage.checksummed_folder import ChecksummedFolder
 class RetiredFiles:
     """Files that the current state does not need any more, but that a saved state may need.
 
-    These are the last saved state and, if they are kept, its older generations. The service falls
-    back to an older generation if the last state is damaged. A file is given by its number in the
-    folder.
+    The saved states are the last one and, if they are kept, its older generations. The service
+    falls back to an older generation if the last state is damaged. A file is given by its number in
+    the folder.
     """
 
     def __init__(self, files: ChecksummedFolder) -> None:

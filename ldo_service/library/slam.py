@@ -357,7 +357,9 @@ def _configured(config: Config | FilePath | None, settings: Mapping[str, object]
         )
     if isinstance(config, Config):
         if settings:
-            raise ConfigError("config is a Config already; put the settings into it.")
+            raise ConfigError(
+                "settings cannot be combined with a Config. Put the settings into this Config."
+            )
         return config
     if config is not None and not isinstance(config, (str, PathLike)):
         raise ConfigError(

@@ -121,7 +121,7 @@ class RestoredState:
 
 
 class DeliveryState:
-    """Builder of what a stage, which runs an actor, saves: messages and the actor's own state.
+    """Builder of the state that a stage saves: its messages and the state of its actor.
 
     The result consists of named parts.
 

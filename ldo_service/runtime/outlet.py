@@ -179,7 +179,7 @@ class Outlet:
     async def flush(self) -> None:
         """Wait until every lossless consumer has received all messages.
 
-        Consumers with policy `Backlog` may be stopped: it waits at most `FLUSH_BACKLOG_S` for them.
+        Wait at most `FLUSH_BACKLOG_S` for consumers with policy `Backlog`; they may be stopped.
         """
         self._post_hellos()  # Each consumer immediately replies with its credit.
         while not self._consumers.all_received(self._seq, awaited_only=True):

@@ -59,4 +59,7 @@ class GenerationFiles:
         if self.is_given_up:
             for file in (self.list_name, *(self.contents.files[part] for part in self.sources)):
                 (self.folder / file).unlink(missing_ok=True)
-            raise OSError(f"{self.folder / self.list_name} was given up")
+            raise OSError(
+                f"{self.folder / self.list_name} was not written, because the generation is not "
+                "needed any more"
+            )

@@ -228,7 +228,8 @@ class FolderStore:
                 ) from error
             raise DataError(
                 f"the state of {actor} in {folder} cannot be read: {error.strerror}. The state is "
-                "unchanged: repair the disk, or raise the limit of the process, and start again."
+                "unchanged. Repair the disk, or raise the limit that the process has reached (for "
+                "open files, `ulimit -n`), and start again."
             ) from error
         if contents and generation == NEWEST and contents.generation:
             self._fallen_back.add(actor)

@@ -78,8 +78,8 @@ class FrameCompensator:
 
         The frame was compensated for the expected motion. If the measured motion differs from it by
         more than `ShutterConfig.realign_ratio`, the frame is compensated again and aligned again.
-        OK frames that become no keyframe are spared this up to `max_linear_ratio`: their pose is
-        only corrected, to first order.
+        Up to `max_linear_ratio`, an OK frame that becomes no keyframe is not aligned again: only
+        its pose is corrected, to first order.
 
         Args:
             frame: The frame of the last call of `expect`.

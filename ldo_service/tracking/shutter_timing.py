@@ -105,7 +105,7 @@ class BandEquations:
 
         Returns:
             Information and right side, [3, 4], of the times in the order of `ShutterTiming`. Their
-            solution is the times themselves, not a change of those that are already compensated.
+            solution is the times themselves, not a change of the times already compensated.
         """
         # Velocities of the reference in the camera frame. All twists change T_reference_camera.
         to_camera = se3.adjoint(self.T_camera_reference)

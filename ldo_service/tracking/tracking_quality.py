@@ -121,8 +121,9 @@ class ResidualHistory:
     def extended(self, alignment: Alignment, config: TrackingQualityConfig) -> "ResidualHistory":
         """Return the history with the noise of one more alignment.
 
-        The noise is limited to `weak_residual` times the running median. A pose that features
-        confirm may have more noise, and a few such frames must not hide a wrong pose after them.
+        The noise is limited to `weak_residual` times the running median. A pose that
+        is confirmed by features may have more noise. A few such frames must not hide a wrong pose
+        after them.
         """
         keep, sigma = config.history - 1, exposure_corrected_sigma(alignment)
         usual_sigma, usual_scale = self._usual(config)
@@ -172,8 +173,8 @@ def classify_tracking(
     The limits have hysteresis. They are stricter after a WEAK frame, unless an independent estimate
     (features or GICP) confirms the pose. They are strictest after a LOST frame, unless such an
     estimate and the odometry prior both confirm the pose. The status changes from LOST to OK
-    directly, never to WEAK. A pose that features confirm closely may have a larger residual, except
-    after a LOST frame.
+    directly, never to WEAK. A pose that is closely confirmed by features may have a larger
+    residual, except after a LOST frame.
 
     Args:
         candidate: Best hypothesis of the frame.

@@ -40,7 +40,7 @@ def guarded(network: Endpoint) -> Iterator[tuple[Endpoint, "GateProcess | None"]
 
     Yields:
         The endpoint with the port for the router, and the gate. If the address has more than host
-        and port, such as `#iface=eth0`, there is no gate: `network` and None.
+        and port, such as `#iface=eth0`, there is no gate, and `network` and None are yielded.
 
     Raises:
         UnavailableError: The address is in use or does not exist.

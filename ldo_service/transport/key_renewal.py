@@ -33,8 +33,8 @@ class KeyRenewal:
     Once a day it also warns of a certificate that expires soon.
     """
 
-    # Time between two looks at the files, seconds. Changed files are read when two looks find the
-    # same, so that a copy is complete.
+    # Time between two checks of the files, seconds. Changed files are read only after two checks
+    # have found them equal, so that a copy is complete.
     PERIOD_S = 2.0
 
     def __init__(

@@ -36,7 +36,9 @@ OF_CLIENT = "This program cannot connect after that."
 
 
 def expiry_warning(valid_until_s: float | None) -> str:
-    """Return "expires in ... days" or "expired ... days ago"; empty if that is far or unknown.
+    """Return "expires in ... days" or "expired ... days ago" if a warning is due, else "".
+
+    A warning is due from `EXPIRY_WARNING_DAYS` before the end of the validity.
 
     Args:
         valid_until_s: End of the validity of a certificate, Unix time in seconds; None if unknown.

@@ -135,7 +135,7 @@ def test_gray_cameras_are_read_if_there_are_no_color_cameras(
             r"times\.txt, line 2: expected a time in seconds, found 'x'",
         ),
         ("times.txt", None, "1\n1\n1\n", r"times\.txt, line 2: the time 1 s is not later"),
-        ("times.txt", None, "0\n", r"times\.txt has 1 lines, but there is an image of number 2"),
+        ("times.txt", None, "0\n", r"times\.txt has 1 lines, expected at least 3"),
         ("poses.txt", None, "1 2 3\n", r"poses\.txt, line 1: expected 12 numbers"),
         ("poses.txt", None, "1 0 0 0 0 1 0 0 0 0 1 0\n", r"poses\.txt has 1 lines"),
         ("poses.txt", None, "2 0 0 0 0 1 0 0 0 0 1 0\n", "expected 12 numbers, the first three"),

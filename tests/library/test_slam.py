@@ -255,7 +255,7 @@ def test_wrong_settings_and_cameras_are_refused(tmp_path: Path) -> None:
         Slam(camera, settings={"mapper.iteration": 3})
     with pytest.raises(ConfigError, match=r"nothing\.yaml"):
         Slam(camera, config=tmp_path / "nothing.yaml")
-    with pytest.raises(ConfigError, match="put the settings into it"):
+    with pytest.raises(ConfigError, match="Put the settings into this Config"):
         Slam(camera, config=load_config(), settings={"mapper.iterations": 3})
     for arguments, message in (
         ({"camera": (640, 480)}, r"ldo_service\.Camera"),

@@ -272,7 +272,7 @@ class ImageEncoder:
         )
 
     def metrics(self) -> dict[str, float]:
-        """Return whether the network runs on a GPU, and whether a device failed."""
+        """Return the metrics of the network, see `Network.metrics`."""
         return self._network.metrics()
 
     def metadata_numbers(self, key: str, count: int) -> tuple[float, ...]:

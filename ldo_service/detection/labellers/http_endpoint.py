@@ -52,7 +52,7 @@ class HttpClientConfig:
         if self.patience_s < self.timeout_s:
             raise ConfigError(
                 f"HttpClientConfig.patience_s={self.patience_s:g} must be at least "
-                f"timeout_s={self.timeout_s:g}, which one attempt may take."
+                f"timeout_s={self.timeout_s:g}, the time limit of one attempt."
             )
         if self.attempts < 1:
             raise ConfigError(f"HttpClientConfig.attempts={self.attempts} must be at least 1.")
