@@ -163,8 +163,8 @@ class QualitySettings:
     # reference keyframe. The default was chosen on one apartment.
     weak_overlap: Ratio = advanced(0.15)
     # A pose is WEAK if the ratio of its residual to the median residual of the last OK frames
-    # exceeds this value. A pose that features confirm closely is WEAK above a ratio of 6, and
-    # LOST above 15.
+    # exceeds this value. A pose that is closely confirmed by features is WEAK above a ratio of 6,
+    # and LOST above 15.
     weak_residual_ratio: Annotated[float, Meta(gt=1)] = advanced(2.5)
     # A pose is LOST if the ratio of its residual to the median residual of the last OK frames
     # exceeds this value.

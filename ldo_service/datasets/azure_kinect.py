@@ -100,6 +100,8 @@ class AzureKinectSequence(Sequence):
 def _contents(path: Path) -> tuple[dict[str, int], bytes | None, tuple[Stream, ...]]:
     """Return the numbers of the video streams by title, the calibration, and unused streams.
 
+    The calibration is None if the file has none.
+
     Raises:
         ConfigError: PyAV is not installed.
         DataError: The file cannot be read.

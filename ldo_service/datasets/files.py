@@ -143,7 +143,9 @@ def _pixels(fields: dict[str, Any], key: str, path: Path) -> int:
     """Return the number of pixels under a key of a JSON object; see `number`."""
     size = number(fields, key, path)
     if not size.is_integer():
-        raise DataError(f'{path}: expected an integer under "{key}", but it is {size:g}.')
+        raise DataError(
+            f'{path}: expected an integer under "{key}", found {size:g}. Correct the file.'
+        )
     return int(size)
 
 

@@ -136,7 +136,7 @@ class OnnxDetector:
         return self._network.providers
 
     def metrics(self) -> dict[str, float]:
-        """Return whether the network runs on a GPU, and whether a device failed."""
+        """Return the metrics of the network, see `Network.metrics`."""
         return self._network.metrics()
 
     def detect(self, image: np.ndarray) -> Detections:

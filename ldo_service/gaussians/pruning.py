@@ -85,7 +85,7 @@ def _mean_around(means: np.ndarray, values: np.ndarray, edge_m: float) -> np.nda
 
 
 def weights(rows: np.ndarray) -> np.ndarray:
-    """Return the approximate contribution to an image of each Gaussian of `rows` [N, 16], [N].
+    """Return, for each Gaussian of `rows` [N, 16], its approximate contribution to an image, [N].
 
     The contribution is the opacity times the product of the two larger standard deviations, m^2.
     """

@@ -115,7 +115,11 @@ class MapReplica:
 
     # --- snapshots --------------------------------------------------------------------------------
     def _collect_part(self, part: MapSnapshot) -> bool:
-        """Store one message of a snapshot; replace the map after the last missing message."""
+        """Store one message of a snapshot; replace the map after the last missing message.
+
+        Returns:
+            True if the map was replaced.
+        """
         self._note_exposures(part)
         if part.version < self.version or (part.version == self.version and not self.is_behind):
             return False
@@ -133,7 +137,11 @@ class MapReplica:
         return True
 
     def _apply_part(self, part: MapSnapshot) -> bool:
-        """Replace all Gaussians in the id range of one message of a snapshot by its Gaussians."""
+        """Replace all Gaussians in the id range of one message of a snapshot by its Gaussians.
+
+        Returns:
+            False if the message has nothing new, so that the map stays the same.
+        """
         self._note_exposures(part)
         is_news = self.is_behind or self._was_cut or part.version > self.version
         if part.version < self.version or not is_news:

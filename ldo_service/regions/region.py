@@ -280,7 +280,7 @@ def merge_observation(region: Region, seen: RegionObservation, max_box_votes: fl
     Args:
         region: The region.
         seen: The observation.
-        max_box_votes: Sum of a label's votes up to which boxes add votes, see `with_box`.
+        max_box_votes: Maximum sum of votes to which boxes can raise a label, see `with_box`.
     """
     proposal = seen.candidate
     surer = max(region, proposal, key=lambda one: one.score)

@@ -112,5 +112,5 @@ class RegionTrackerConfig:
 
     @property
     def max_box_votes(self) -> float:
-        """Sum of a label's votes up to which boxes add votes; 0 if boxes do not vote."""
+        """Maximum sum of votes to which boxes can raise a label; 0 if boxes do not vote."""
         return self.answer_weight if self.boxes_vote else 0.0

@@ -127,7 +127,7 @@ class Outlets:
     def past(self) -> dict[str, OutletPosition | None]:
         """Return the position of each outlet to save with the state of the actor, by topic name.
 
-        See `Outlet.position`.
+        See `Outlet.position`; it is None if the topic has no required consumer.
         """
         return {outlet.topic.name: outlet.position() for outlet in self._all.values()}
 

@@ -47,7 +47,7 @@ def available_memory_mb() -> float | None:
 
 
 def trim_memory() -> None:
-    """Return freed memory to the operating system.
+    """Give freed memory back to the operating system.
 
     Otherwise glibc keeps free memory that lies between blocks in use. It kept 280 MB after three
     laps through the sequence `synthetic:flat`. On systems other than Linux the function does

@@ -62,7 +62,7 @@ class EvaluatedRun:
         return self.results["labels"][-1]["lists"]["COCO"]["from 0.2 %"]
 
     def consistency(self) -> float | None:
-        """Return the label consistency of the newest map."""
+        """Return the label consistency of the newest map; None if no pixel was compared."""
         return self.results["labels"][-1]["consistency"]
 
 

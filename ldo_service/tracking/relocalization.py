@@ -219,7 +219,7 @@ class Relocalizer:
     def _first_verified(
         self, view: Pyramid, poses: Sequence[PosedRecord], history: ResidualHistory
     ) -> tuple[PosedRecord, tuple[ReferenceKeyframe, PoseHypothesis]] | None:
-        """Return the first record and feature pose that direct alignment verifies.
+        """Return the first record and feature pose that direct alignment verifies, or None.
 
         The second element of the result is the keyframe of that record, with the alignment to it.
         """

@@ -6,8 +6,8 @@ other measures: overlap with the reference keyframe, noise relative to its runni
 number of the information, and confirmation by features or GICP.
 
 The noise also grows at right poses: after blur, a change of exposure, at a steep view, or after a
-large motion. Features have errors of another kind, so a pose that features confirm closely is
-accepted with more noise.
+large motion. Features have errors of another kind, so a pose that is closely confirmed by features
+is accepted with more noise.
 """
 
 from dataclasses import dataclass, replace

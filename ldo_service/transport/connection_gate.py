@@ -169,7 +169,7 @@ class Side(asyncio.Protocol):
             sender.resume_reading()
 
     def _sender(self) -> asyncio.Transport | None:
-        """Return the connection whose bytes are written to this one."""
+        """Return the connection whose bytes are written to this one; None before it exists."""
         assert self._connection is not None
         return self._connection.router if self._is_client else self._connection.client
 

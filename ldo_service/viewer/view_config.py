@@ -38,7 +38,7 @@ class ViewerConfig:
 
 
 def viewer_config(settings: ViewerSettings) -> ViewerConfig:
-    """Return the address, the number of Gaussians and the update interval of the viewer."""
+    """Return the parameters of the viewer, with the values of its settings."""
     return ViewerConfig(
         address=settings.address,
         port=settings.port,

@@ -153,7 +153,7 @@ class Tsdf:
         if total > self.config.max_blocks:
             raise ConfigError(
                 f"voxels of {self.config.voxel_m} m need more than max_memory_mb="
-                f"{self.config.max_memory_mb} for this map. Choose larger voxels or more memory."
+                f"{self.config.max_memory_mb} for this map. Choose larger voxels (--voxel)."
             )
         self._blocks = np.concatenate([self._blocks, new])
         keys = pack(self._blocks)
