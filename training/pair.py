@@ -99,7 +99,7 @@ def batches(material: Views, rng: np.random.Generator, side_px: int = INPUT_PX) 
 
 
 def named(regions: VisibleBoxes) -> tuple[VisibleBoxes, np.ndarray]:
-    """Return the regions that have a name, and the index of each name in (*NAMES, NO_NAME)."""
+    """Return the regions in NAMES or without an object, and their index in (*NAMES, NO_NAME)."""
     own = {CLASS_NAMES.index(name): k for k, name in enumerate(NAMES)} | {NO_THING: len(NAMES)}
     chosen = regions.chosen(np.array([k in own for k in regions.class_ids.tolist()], bool))
     return chosen, np.array([own[k] for k in chosen.class_ids.tolist()], np.int64)

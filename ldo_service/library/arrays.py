@@ -12,7 +12,7 @@ FrameArray = Any  # An array that supports DLPack or the buffer protocol.
 
 
 def array_of(name: str, value: FrameArray) -> np.ndarray:
-    """Return an array that a caller passed as a NumPy array, without a copy if possible.
+    """Convert an array of the caller into a NumPy array, without a copy if possible.
 
     Raises:
         FrameError: The value is no array, or lies in the memory of a GPU.

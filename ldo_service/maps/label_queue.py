@@ -45,11 +45,11 @@ class LabelRequestQueue:
         return region in self._waiting
 
     def add(self, request: LabelRequest, surface_m2: float) -> list[LabelRequest]:
-        """Add a request, and return the requests that are dropped from the queue.
+        """Add a request, and return the requests that leave the queue without being sent.
 
-        The new request replaces an earlier one of the same region. If the queue is then too long,
-        one request is dropped: the one that shows the least surface beyond what earlier requests of
-        its region showed.
+        The new request replaces a waiting one of the same region. If the queue is then too long, it
+        also drops the request that shows the least surface beyond what the sent requests of its
+        region showed.
 
         Args:
             request: Label request of a region.

@@ -192,7 +192,8 @@ def read_objects(folder: Path) -> MapObjects:
     path = folder / OBJECTS
     if not folder.is_dir():
         raise DataError(
-            f"{folder} is not a folder. Give the folder of a finished `ldo run`, or `live`."
+            f"{folder} is not a folder. Give the folder of a finished `ldo run`, or the word "
+            "`live` for a running service."
         )
     if not path.is_file():
         refuse_state(folder)

@@ -348,7 +348,7 @@ def test_objects_get_their_names_also_when_all_labels_arrive_after_the_walk() ->
 
 
 def test_label_result_applies_to_all_views_of_its_request(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The exception is a label that the detector gives too: the detector labels the other views."""
+    """A label that the detector gives too applies to one view: the detector labels the others."""
 
     def labelled(name: str) -> int:
         mapper = Mapper(CONFIG, has_labeller=True)

@@ -139,9 +139,10 @@ def needles() -> np.ndarray:
 
 
 def faint_wall() -> np.ndarray:
-    """Return 250 faint Gaussians in front of 60 opaque ones, so that a batch of 256 ends between.
+    """Return 250 faint Gaussians in front of 60 opaque ones.
 
-    The transmittance of all blocks falls below the limit only in the second batch.
+    The first batch of 256 has six of the opaque ones, which do not cover all blocks. Only in the
+    second batch, the transmittance of all blocks is therefore below the limit.
     """
     rows = np.concatenate([wall(250, 10, (-5.3, -4.0)), wall(60, 11, (-1, 1))])
     rows[:250, :3] *= 0.4
