@@ -80,7 +80,7 @@ def test_color_alone_aligns_a_frame_without_depth(room) -> None:
 
 
 def wall(T_wall_camera: np.ndarray, camera: Camera, is_textured: bool) -> RgbdFrame:
-    """Return a view of a plane from 2 m, where the camera is moved by a transform."""
+    """Return a view of the plane z = 2 m of the frame `wall`."""
     T = T_wall_camera.copy()
     T[2, 3] -= 2.0
     rays = camera.rays() @ T[:3, :3].T
