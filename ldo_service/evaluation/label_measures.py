@@ -77,7 +77,7 @@ def correspondences(
 
 
 def agreement(first: np.ndarray, second: np.ndarray, pixels: Correspondences) -> Agreement:
-    """Count the corresponding pixels that show an object, and how many of them have equal labels.
+    """Count the pairs of pixels of which at least one shows an object, and those of equal labels.
 
     Args:
         first: Labels of the first view, [H, W]; 0 is background.

@@ -136,7 +136,10 @@ def require_equal(got: Outcome, wanted: Outcome) -> None:
     """
     changed = np.mean(got.values["steps"] != wanted.values["steps"])
     if changed > MAX_BORDERLINE:
-        raise DeviceError(f"{changed:.1%} of the Gaussians are visible on one device alone.")
+        raise DeviceError(
+            f"{changed:.1%} of the Gaussians are visible on only one of GPU and CPU, expected at "
+            f"most {MAX_BORDERLINE:.1%}."
+        )
     for name, difference in differences(got, wanted).items():
         limit = TOLERANCE[name.partition(" ")[0]]
         if not difference <= limit:  # NaN is above every limit.

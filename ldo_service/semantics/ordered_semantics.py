@@ -160,7 +160,7 @@ class OrderedSemantics:
 
     # --- copy -------------------------------------------------------------------------------------
     def has_work(self) -> bool:
-        """Return whether `step` can be called: a `DelayedCopy` exists and misses no result."""
+        """Return whether `step` can be called: a `DelayedCopy` exists, and all results are here."""
         return self._copy is not None and not self._waiting and not self._sent
 
     def step(self) -> "OrderedStep":

@@ -357,7 +357,7 @@ class FolderStore:
             self._remove_unused(actor, copies)
 
     def exists(self, actor: str, generation: int = NEWEST) -> bool:
-        """Return whether an actor has a state in a generation; by default after the last step."""
+        """Return whether an actor has a state in a generation; NEWEST is that of its last step."""
         return (self.folder / actor / list_name(generation)).exists()
 
     def is_kept(self, actor: str) -> bool:

@@ -34,11 +34,11 @@ class KeyframeConfig:
     min_frames: int = 1
     # Maximum number of frames between reference keyframes while the camera moves.
     max_frames: int = 30
-    # A relay is a reference that is used for tracking but not mapped. A frame can become one while
-    # the caller allows no keyframe. It does so if its motion exceeds this multiple of
-    # max_rotation_rad or max_translation, or if its overlap is below min_overlap divided by this
-    # ratio. With a ratio of 1, each held-out frame that needs a keyframe would become a relay, and
-    # so add a link to the chain of relative poses.
+    # A relay is a reference that is used for tracking but not mapped. While the caller allows no
+    # keyframe, as at held-out frames, a frame becomes a relay if its motion exceeds this multiple
+    # of max_rotation_rad or max_translation, or if its overlap is below min_overlap divided by this
+    # ratio. A ratio of 1 would make a relay of each such frame that needs a keyframe, and each
+    # relay adds a link to the chain of relative poses.
     relay_ratio: float = 1.5
     # The camera stands still if the overlap is above still_overlap, and rotation (rad) and
     # translation (fraction of the median depth) are below still_motion.

@@ -123,7 +123,7 @@ class MapFrame:
         self._keep(newest, keyframe)
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the stored poses, without the last correction."""
+        """Return the stored poses; the last correction itself is not part of them."""
         return self._poses.snapshot()
 
     def restore(self, state: Mapping[str, Any], correction: MapCorrection | None) -> None:

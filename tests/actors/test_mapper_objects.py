@@ -341,7 +341,7 @@ def names_after_walk(*, is_slow: bool) -> list[str]:
 
 
 def test_objects_get_their_names_also_when_all_labels_arrive_after_the_walk() -> None:
-    """The ball is 20 pixels wide: in most views it has too few Gaussians to count."""
+    """The ball is 20 pixels wide, and most views show too few of its Gaussians to observe it."""
     prompt, late = names_after_walk(is_slow=False), names_after_walk(is_slow=True)
     assert late == [name for name in prompt if name != f"my {BALL.name}"]
     assert late == ["couch", "my chair", "my chair", "my dining table"]

@@ -289,7 +289,7 @@ def _settle(robots: list[Robot]) -> None:
 
 # --- results --------------------------------------------------------------------------------------
 def accounts(robot: Robot) -> dict[str, int]:
-    """Return the number of frames that a robot was sent, tracked, dropped and lost."""
+    """Return how many frames of a robot were sent, tracked, dropped and lost."""
     (camera,) = [i for i in robot.health["frame_source"].inputs if i.topic == "camera/rgbd"]
     (made,) = [o for o in robot.health["frame_source"].outputs if o.topic == "frame/rgbd"]
     (taken,) = [i for i in robot.health["tracker"].inputs if i.topic == "frame/rgbd"]

@@ -26,7 +26,7 @@ def keyframe_at(x_m: float, id: int = 0, frame: int = 0, turned: bool = False) -
 
 
 def walk(*places: tuple[float, int]) -> dict[int, SeenKeyframe]:
-    """Return keyframes by id from their x in m and their frame."""
+    """Return keyframes by id; a place is the x of a keyframe in meters, and its frame number."""
     return {k: keyframe_at(x_m, k, frame) for k, (x_m, frame) in enumerate(places)}
 
 

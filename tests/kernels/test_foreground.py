@@ -123,9 +123,10 @@ def test_scenes_have_steps_creases_holes_and_things() -> None:
 
 
 def test_pieces_hang_together_by_sides_alone_however_they_wind() -> None:
-    """Check a labyrinth of blocks with depth.
+    """Check that the pieces are the connected components of OpenCV.
 
-    The middle of a block, and the pixels that connect it to the next, are smooth.
+    In a random pattern of blocks of 3x3 pixels with and without depth, only the middle of a block
+    and the pixels that connect it to the next block with depth are smooth.
     """
     labyrinth = np.random.default_rng(0).random((40, 60)) < 0.6
     depth_m = np.kron(labyrinth, np.ones((3, 3))).astype(np.float32)

@@ -99,7 +99,7 @@ def first_frame_that_needs_a_keyframe(
 # --- odometry -------------------------------------------------------------------------------------
 @dataclass(frozen=True)
 class ReturnedCamera:
-    """A camera that returned to where it needs a keyframe, in a map of known keyframes."""
+    """A camera that returned to mapped keyframes, one of which it needs as its reference."""
 
     odometry: Odometry
     correction: MapCorrection
