@@ -240,12 +240,24 @@ class TrackedSource:
             np.array([stamps[k] for k in known]),
             np.array([builder.views.exposures[k].matrix for k in known]),
         )
+        return self.held_out_errors(builder.gaussians.rows, exposures, max(stamps.values()))
+
+    def held_out_errors(
+        self, rows: np.ndarray, exposures: Exposures, last_ns: int
+    ) -> HeldOutErrors:
+        """Return the errors of a map on the held-out frames before its last keyframe.
+
+        Args:
+            rows: Gaussians of the map, [N, 16]; see `gaussians.rows`.
+            exposures: Exposures of the keyframes.
+            last_ns: Stamp of the last keyframe, nanoseconds.
+
+        Raises:
+            ConfigError: No held-out frame lies before the last keyframe.
+        """
         map_ = self.run.maps[0]
-        posed = PosedMap(
-            "trial", builder.gaussians.rows, map_.trajectory, exposures, None, map_.corrections
-        )
+        posed = PosedMap("trial", rows, map_.trajectory, exposures, None, map_.corrections)
         valid, found = valid_pixels(self.sequence.raw_camera), []
-        last_ns = max(stamps.values())
         for frame in self.run.frames:
             if not frame.is_held_out or frame.is_lost or frame.stamp_ns > last_ns:
                 continue
