@@ -15,7 +15,7 @@ has the CPU time of the map builder: the keyframe and the rendering for `map/vie
 """
 
 import json
-import resource
+import re
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -47,6 +47,16 @@ EARLIER = (
 )
 
 
+def peak_resident_mb() -> float:
+    """Return the peak of the resident memory of this process.
+
+    `getrusage` would give that of the parent if it is larger, because this process starts as its
+    copy.
+    """
+    found = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())
+    return int(found[1]) / 1024 if found else 0.0
+
+
 def tracker(source: str, is_calibrated: bool) -> Callable[[str], Answer]:
     """Return a function that tracks the frame of a task."""
     names = EARLIER if find_spec("ldo_service.wire") else CURRENT
@@ -76,7 +86,7 @@ def mapper(folder: Path, effort: int) -> Callable[[str], Answer]:
     render = getattr(builder, "render_keyframe", None) or builder.shown  # type: ignore[attr-defined]
 
     def save(path: str) -> Answer:
-        resident_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        resident_mb = peak_resident_mb()
         known = sorted(k for k in stamps_ns if k in builder.views.exposures)
         np.savez(
             path,
