@@ -278,17 +278,17 @@ def align(
             converged = _image_motion_px(step, target, reference) < config.stop_px
             if converged:
                 break
-    return evaluate(reference, frame, T, appearance, config, count, converged)
+    return _evaluate(reference, frame, T, appearance, config, count, converged)
 
 
-def evaluate(
+def _evaluate(
     reference: ReferencePoints,
     frame: Pyramid,
     T_camera_reference: np.ndarray,
     appearance: BrightnessModel,
     config: AlignConfig,
-    iterations: int = 0,
-    converged: bool = True,
+    iterations: int,
+    converged: bool,
 ) -> Alignment:
     """Evaluate the residuals of a given pose on the finest pyramid level, without optimization.
 

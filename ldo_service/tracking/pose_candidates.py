@@ -12,7 +12,7 @@ import numpy as np
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 
-from .alignment import AlignConfig, Alignment, align, evaluate
+from .alignment import AlignConfig, Alignment, align, normal_equations
 from .features import FeatureConfig, GicpConfig, detect, estimate_pose, register_gicp
 from .keyframes import ReferenceKeyframe
 from .motion import image_motion_rad
@@ -116,10 +116,13 @@ def support(
         intensity_sigma=min(c.alignment.intensity_sigma for c in others),
         depth_noise_scale=min(c.alignment.depth_noise_scale for c in others),
     )
-    T_camera_keyframe = se3.inverse(own.T_reference_camera)
-    seen = evaluate(keyframe.reference, view, T_camera_keyframe, common, config)
-    return seen.photometric_inliers * (
-        PHOTOMETRIC_ONLY_WEIGHT * seen.overlap + seen.geometric_inliers * seen.paired
+    points = keyframe.reference.points[0]
+    T_camera_keyframe = se3.orthonormalize(se3.inverse(own.T_reference_camera))
+    seen = normal_equations(points, view.levels[0], T_camera_keyframe, common, config.residuals)
+    total = max(points.shape[1], 1)
+    return seen.photometric.inlier_fraction * (
+        PHOTOMETRIC_ONLY_WEIGHT * (seen.visible / total)
+        + seen.geometric.inlier_fraction * (seen.geometric.count / total)
     )
 
 
