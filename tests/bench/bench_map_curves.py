@@ -1,7 +1,8 @@
 """Held-out errors against the CPU time of the mapper, compared with those of another checkout.
 
     python -m tests.bench.bench_map_curves [SOURCE ...] [--other CHECKOUT] [--frames N]
-                                           [--efforts N ...] [--runs FOLDER] [--plots FOLDER]
+                                           [--efforts N ...] [--set FIELD=VALUE ...] [--seed N]
+                                           [--runs FOLDER] [--plots FOLDER]
 
 SOURCE: data sets or synthetic sequences; default: tum/kitchen and replica/apartment_floor1 in
 LDO_DATA, and synthetic:flat. CHECKOUT has its environment in .venv, and the code of commit 18f9264
@@ -9,8 +10,10 @@ or later. Each mapper and each effort is a process of its own with one thread. E
 keyframe before the first one maps the next keyframe, so other load affects all equally. All map the
 keyframes that this checkout has tracked, at their final poses. This checkout evaluates all maps.
 
-The plot shows the mean PSNR against the CPU time per keyframe. `equal` is the CPU time of this
-checkout where its curve reaches the PSNR that the other one reaches with the highest effort.
+With --set, this checkout also maps with other values of fields of `MapBuilderConfig`, as in
+`bench_map.py`. --seed sets the seed of this checkout. The plots show the mean PSNR against the CPU
+time per keyframe. The last lines give the CPU time, relative to the first variant with the highest
+effort, at which the curve of another variant reaches its PSNR.
 """
 
 import argparse
@@ -34,19 +37,28 @@ from .bench_map_view import default_sources
 from .checkouts import turn, workers
 
 HEADER = """\
-| source, keyframes | checkout | effort | ms per keyframe | ratio | iterations | Gaussians | MB \
+| source, keyframes | mapper | effort | ms per keyframe | ratio | iterations | Gaussians | MB \
 | PSNR dB | depth L1 cm |
 |---|---|---|---|---|---|---|---|---|---|"""
 # Sizes of a plot in pixels: width, height, and margins at the left and at the bottom.
 WIDTH, HEIGHT, LEFT, BOTTOM = 460, 300, 56, 44
-COLORS = "#1f6feb", "#d1495b"
+COLORS = "#1f6feb", "#d1495b", "#2e7d32"
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """Mapper of one checkout, with values of fields of its `MapBuilderConfig`."""
+
+    name: str
+    checkout: Path | None
+    settings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """Map of one checkout with one effort."""
+    """Map of one variant with one effort."""
 
-    checkout: str
+    variant: str
     effort: int
     cpu_ms: float  # Per keyframe.
     iterations: int
@@ -74,30 +86,40 @@ def save_keyframes(tracked: TrackedSource, folder: Path) -> Iterator[str]:
         yield name
 
 
+def variants(arguments: argparse.Namespace) -> list[Variant]:
+    """Return the mappers to compare; the ratios are relative to the first one."""
+    seed = (f"seed={arguments.seed}",)
+    compared = [Variant("this one", None, seed)]
+    if arguments.other:
+        compared.insert(0, Variant(arguments.other.name, arguments.other))
+    if arguments.set:
+        compared.append(Variant(" ".join(arguments.set), None, (*seed, *arguments.set)))
+    return compared
+
+
 def measure(
-    tracked: TrackedSource, checkouts: list[Path | None], efforts: list[int], folder: Path
+    tracked: TrackedSource, compared: list[Variant], efforts: list[int], folder: Path
 ) -> list[Point]:
-    """Map the keyframes with each checkout and each effort, and evaluate the maps."""
-    places = [(checkout, effort) for checkout in checkouts for effort in efforts]
-    tasks = [(checkout, ("map", str(folder), str(effort))) for checkout, effort in places]
+    """Map the keyframes with each variant and each effort, and evaluate the maps."""
+    places = [(variant, effort) for variant in compared for effort in efforts]
+    tasks = [
+        (variant.checkout, ("map", str(folder), str(effort), *variant.settings))
+        for variant, effort in places
+    ]
     cpu_s, names = np.zeros(len(places)), [*save_keyframes(tracked, folder)]
     points = []
     with workers(tasks) as started:
         for number, name in enumerate(names):
             cpu_s += [answer["cpu_s"] for answer in turn(started, number, name)]
-        for (checkout, effort), worker, spent_s in zip(places, started, cpu_s, strict=True):
+        for (variant, effort), worker, spent_s in zip(places, started, cpu_s, strict=True):
             answer = worker.run(str(folder / "map.npz"))
             saved = np.load(folder / "map.npz")
             exposures = Exposures(saved["stamps_ns"], saved["exposures"])
             last_ns = int(saved["stamps_ns"].max())
             errors = tracked.held_out_errors(saved["rows"], exposures, last_ns)
-            name, cpu_ms = name_of(checkout), 1000 * float(spent_s) / len(names)
-            points.append(Point(name, effort, cpu_ms, errors=errors, **answer))
+            cpu_ms = 1000 * float(spent_s) / len(names)
+            points.append(Point(variant.name, effort, cpu_ms, errors=errors, **answer))
     return points
-
-
-def name_of(checkout: Path | None) -> str:
-    return "this one" if checkout is None else checkout.name
 
 
 def rows_of(source: str, points: list[Point], reference_ms: float) -> Iterator[str]:
@@ -105,7 +127,7 @@ def rows_of(source: str, points: list[Point], reference_ms: float) -> Iterator[s
     for point in points:
         yield (
             (
-                f"| {source} | {point.checkout} | {point.effort} | {point.cpu_ms:.0f} | "
+                f"| {source} | {point.variant} | {point.effort} | {point.cpu_ms:.0f} | "
                 f"{point.cpu_ms / reference_ms:.2f} | {point.iterations} | {point.gaussians:,} | "
                 f"{point.resident_mb:.0f} | {text_of(point.errors).replace(', ', ' | ')} |"
             )
@@ -183,21 +205,20 @@ def report(source: str, runs: Path, arguments: argparse.Namespace) -> None:
     tracked = TrackedSource.record(
         open_sequence(source), arguments.frames, load_config(), runs, lambda *_: None
     )
-    checkouts: list[Path | None] = [arguments.other, None] if arguments.other else [None]
+    compared = variants(arguments)
     with tempfile.TemporaryDirectory() as folder:
-        points = measure(tracked, checkouts, sorted(arguments.efforts), Path(folder))
+        points = measure(tracked, compared, sorted(arguments.efforts), Path(folder))
     curves = {
-        name: [point for point in points if point.checkout == name]
-        for name in map(name_of, checkouts)
+        variant.name: [point for point in points if point.variant == variant.name]
+        for variant in compared
     }
-    reference, ours = next(iter(curves.values()))[-1], curves[name_of(None)]
+    reference = next(iter(curves.values()))[-1]
     name = tracked.sequence.name
     print(*rows_of(f"{name}, {len(tracked.run.keyframes)}", points, reference.cpu_ms), sep="\n")
-    cpu_ms = cpu_ms_at(ours, reference.errors.mean_psnr_db)
-    if cpu_ms is None:
-        print(f"{name}: this checkout does not reach {reference.errors.mean_psnr_db:.2f} dB")
-    else:
-        print(f"{name}: equal PSNR at {cpu_ms:.0f} ms, {cpu_ms / reference.cpu_ms:.2f} times")
+    for variant in compared[1:]:
+        cpu_ms = cpu_ms_at(curves[variant.name], reference.errors.mean_psnr_db)
+        found = "not reached" if cpu_ms is None else f"at {cpu_ms / reference.cpu_ms:.2f} times"
+        print(f"{name}, {variant.name}: PSNR of {reference.variant} {found}", flush=True)
     if arguments.plots:
         file = "map-" + re.sub(r"[^A-Za-z0-9]+", "-", name) + ".svg"
         (arguments.plots / file).write_text(plot(name, curves))
@@ -209,6 +230,8 @@ def main() -> None:
     parser.add_argument("--other", type=Path, metavar="CHECKOUT")
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--efforts", type=int, nargs="+", default=[2, 4, 8, 12])
+    parser.add_argument("--set", action="append", default=[], metavar="FIELD=VALUE")
+    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--runs", type=Path, metavar="FOLDER")
     parser.add_argument("--plots", type=Path, metavar="FOLDER")
     arguments = parser.parse_args()

@@ -1,7 +1,7 @@
 """Worker that tracks or maps with the code of one checkout, for comparisons of commits.
 
     python checkout_worker.py track SOURCE [calibrated]
-    python checkout_worker.py map FOLDER EFFORT
+    python checkout_worker.py map FOLDER EFFORT [FIELD=VALUE ...]
 
 `checkouts.py` starts one worker per checkout and gives them turns. Each line on stdin is a task,
 and the worker answers it with one line of JSON on stdout. The program must run in any checkout
@@ -11,7 +11,8 @@ Tasks of `track` are numbers of frames. With `calibrated`, the tracker has no se
 after the first frames of a run. The answer has the CPU time of the tracker without the
 decoding of images, the status, and T_odom_camera. Tasks of `map` are names of keyframes that
 `bench_map_curves.py` has saved in FOLDER, or a path for the map, which ends with ".npz". The answer
-has the CPU time of the map builder: the keyframe and the rendering for `map/view`.
+has the CPU time of the map builder: the keyframe and the rendering for `map/view`. FIELD is a field
+of `MapBuilderConfig`, as in `bench_map.py`.
 """
 
 import json
@@ -80,9 +81,13 @@ def tracker(source: str, is_calibrated: bool) -> Callable[[str], Answer]:
     return track
 
 
-def mapper(folder: Path, effort: int) -> Callable[[str], Answer]:
+def mapper(folder: Path, effort: int, settings: list[str]) -> Callable[[str], Answer]:
     """Return a function that maps the keyframe of a task, or saves the map."""
-    builder, stamps_ns = MapBuilder(), dict[int, int]()
+    config = MapBuilder().config
+    for setting in settings:
+        path, _, value = setting.partition("=")
+        config = import_module("tests.bench.bench_map").changed(config, path, json.loads(value))
+    builder, stamps_ns = MapBuilder(config), dict[int, int]()
     render = getattr(builder, "render_keyframe", None) or builder.shown  # type: ignore[attr-defined]
 
     def save(path: str) -> Answer:
@@ -128,7 +133,7 @@ def main() -> None:
     if sys.argv[1] == "track":
         work = tracker(sys.argv[2], is_calibrated="calibrated" in sys.argv[3:])
     else:
-        work = mapper(Path(sys.argv[2]), int(sys.argv[3]))
+        work = mapper(Path(sys.argv[2]), int(sys.argv[3]), sys.argv[4:])
     for task in tasks():
         print(json.dumps(work(task)), flush=True)
 
