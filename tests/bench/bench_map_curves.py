@@ -60,7 +60,7 @@ class Point:
 
     variant: str
     effort: int
-    cpu_ms: float  # Per keyframe.
+    cpu_ms: float  # CPU time per keyframe, milliseconds.
     iterations: int
     gaussians: int
     resident_mb: float  # Peak of the process.
