@@ -5,8 +5,8 @@
 SOURCE: data sets or synthetic sequences; default: tum/kitchen and replica/apartment_floor1 in
 LDO_DATA, and synthetic:flat. CHECKOUT has its environment in .venv, and the code of commit 18f9264
 or later. All trackers run with their defaults on one thread, without other actors, and track each
-frame one directly after the other. `calibrated` is this checkout without self-calibration, as after
-the first frames of a run. Times exclude the decoding of images and the first five frames.
+frame one directly after the other. The last row of each source is this checkout without
+self-calibration. Times exclude the decoding of images and the first five frames.
 """
 
 import argparse
@@ -30,7 +30,7 @@ HEADER = """\
 |---|---|---|---|---|---|---|---|"""
 
 
-CALIBRATED = "calibrated"
+WITHOUT = "without self-calibration"
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class Variant:
 
 def variants(other: Path | None) -> list[Variant]:
     """Return the trackers to compare; the ratios are relative to the first one."""
-    ours = [Variant("this one", None), Variant(f"this one, {CALIBRATED}", None, (CALIBRATED,))]
+    ours = [Variant("this one", None), Variant(f"this one, {WITHOUT}", None, (WITHOUT,))]
     return ours if other is None else [Variant(other.name, other), *ours]
 
 

@@ -1,18 +1,18 @@
 """Worker that tracks or maps with the code of one checkout, for comparisons of commits.
 
-    python checkout_worker.py track SOURCE [calibrated]
+    python checkout_worker.py track SOURCE ["without self-calibration"]
     python checkout_worker.py map FOLDER EFFORT [FIELD=VALUE ...]
 
 `checkouts.py` starts one worker per checkout and gives them turns. Each line on stdin is a task,
 and the worker answers it with one line of JSON on stdout. The program must run in any checkout
 since commit 18f9264, so it knows the earlier and the current form of names that have changed.
 
-Tasks of `track` are numbers of frames. With `calibrated`, the tracker has no self-calibration, as
-after the first frames of a run. The answer has the CPU time of the tracker without the
-decoding of images, the status, and T_odom_camera. Tasks of `map` are names of keyframes that
-`bench_map_curves.py` has saved in FOLDER, or a path for the map, which ends with ".npz". The answer
-has the CPU time of the map builder: the keyframe and the rendering for `map/view`. FIELD is a field
-of `MapBuilderConfig`, as in `bench_map.py`.
+Tasks of `track` are numbers of frames. The answer has the CPU time of the tracker without the
+decoding of images, the status, and T_odom_camera.
+
+Tasks of `map` are names of keyframes that `bench_map_curves.py` has saved in FOLDER, or a path for
+the map, which ends with ".npz". The answer has the CPU time of the map builder: the keyframe and
+the rendering for `map/view`. FIELD is a field of `MapBuilderConfig`, as in `bench_map.py`.
 """
 
 import json
@@ -58,14 +58,14 @@ def peak_resident_mb() -> float:
     return int(found[1]) / 1024 if found else 0.0
 
 
-def tracker(source: str, is_calibrated: bool) -> Callable[[str], Answer]:
+def tracker(source: str, is_calibrating: bool) -> Callable[[str], Answer]:
     """Return a function that tracks the frame of a task."""
     names = EARLIER if find_spec("ldo_service.wire") else CURRENT
     actor_type, to_message, from_message = (
         getattr(import_module(module), name) for module, name in names
     )
     config = import_module(names[0][0]).TrackerConfig()
-    if is_calibrated:
+    if not is_calibrating:
         config = replace(config, calibration=replace(config.calibration, views=()))
     sequence, actor = open_sequence(source), actor_type(config)
 
@@ -131,7 +131,7 @@ def tasks() -> Iterator[str]:
 def main() -> None:
     cv2.setNumThreads(1)
     if sys.argv[1] == "track":
-        work = tracker(sys.argv[2], is_calibrated="calibrated" in sys.argv[3:])
+        work = tracker(sys.argv[2], is_calibrating="without self-calibration" not in sys.argv[3:])
     else:
         work = mapper(Path(sys.argv[2]), int(sys.argv[3]), sys.argv[4:])
     for task in tasks():
