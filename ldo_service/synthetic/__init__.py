@@ -12,7 +12,10 @@ Sequences:
 - `room-noisy`, `tour-noisy`, `person-noisy`: The sequences above with the depth errors of a Kinect.
 - `flat`: Two rooms and a corridor with ground-truth labels, designed to be hard for SLAM.
 - `twins`: Four offices along a corridor that look alike and differ only in their objects.
-- `flat-exact`, `twins-exact`: The same scenes without motion blur, noise and other sensor errors.
+- `corridor`: A long corridor with weak texture, equal doors and few objects, walked to its end and
+  back.
+- `flat-exact`, `twins-exact`, `corridor-exact`: The same scenes without motion blur, noise and
+  other sensor errors.
 - `room-handheld`, `tour-handheld`, `person-handheld`, `flat-handheld`: Faster motion, seen by a
   camera with simulated effects of real cameras, such as motion blur. All effects are on by default.
   A colon and effect names joined by `+` select some: `tour-handheld:rolling-shutter+stereo`.

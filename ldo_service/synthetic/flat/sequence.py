@@ -1,6 +1,7 @@
-"""Sequences through two buildings, with a parallel renderer that fills their cache.
+"""Sequences through three buildings, with a parallel renderer that fills their cache.
 
-`flat` is a furnished flat of two rooms, and `twins` are four equal offices along a corridor.
+`flat` is a furnished flat of two rooms, `twins` are four equal offices along a corridor, and
+`corridor` is a long corridor with weak texture.
 """
 
 from collections.abc import Callable
@@ -18,6 +19,7 @@ from ldo_service.geometry import Camera, RawFrame, Trajectory
 from ldo_service.geometry.sequence import FrameLabels, Sequence, TrueLabels
 
 from .cache import CachedFrame, FrameCache
+from .corridor import corridor_walk, furnished_corridor
 from .render import FlatRenderer
 from .scene import Flat, furnished_flat
 from .scene_object import CLASS_NAMES, SceneObject
@@ -40,11 +42,12 @@ class ScenePlan:
 PLANS = {
     "flat": ScenePlan("1", furnished_flat, hand_held),
     "twins": ScenePlan("twins 2", furnished_twins, twins_walk),
+    "corridor": ScenePlan("corridor 1", furnished_corridor, corridor_walk),
 }
 # Focal length in image widths: a horizontal field of view of 63 degrees, as in a Kinect.
 FOCAL_PER_WIDTH = 0.8125
-# The working width of the tracker. The walk is long, and smaller images are rendered faster.
-TWINS_WIDTH_PX, TWINS_HEIGHT_PX = 320, 240
+# The working width of the tracker. Long walks have smaller images, which are rendered faster.
+LONG_WIDTH_PX, LONG_HEIGHT_PX = 320, 240
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,8 +59,8 @@ class FlatConfig:
     # True adds motion blur, exposure drift, noise and a Kinect's depth errors.
     noise: bool = True
     seed: int = 0  # Seed of textures, materials, hand shake and noise.
-    # Building: the furnished `flat`, or `twins`, four equal offices.
-    scene: Literal["flat", "twins"] = field(default="flat", repr=False)
+    # Building: the furnished `flat`, `twins`, four equal offices, or `corridor`.
+    scene: Literal["flat", "twins", "corridor"] = field(default="flat", repr=False)
 
     def __post_init__(self) -> None:
         if self.width_px < 16 or self.height_px < 16:
@@ -72,8 +75,10 @@ class FlatConfig:
 NAMED = {
     "flat": FlatConfig(),
     "flat-exact": FlatConfig(noise=False),
-    "twins": FlatConfig(TWINS_WIDTH_PX, TWINS_HEIGHT_PX, scene="twins"),
-    "twins-exact": FlatConfig(TWINS_WIDTH_PX, TWINS_HEIGHT_PX, noise=False, scene="twins"),
+    "twins": FlatConfig(LONG_WIDTH_PX, LONG_HEIGHT_PX, scene="twins"),
+    "twins-exact": FlatConfig(LONG_WIDTH_PX, LONG_HEIGHT_PX, noise=False, scene="twins"),
+    "corridor": FlatConfig(LONG_WIDTH_PX, LONG_HEIGHT_PX, scene="corridor"),
+    "corridor-exact": FlatConfig(LONG_WIDTH_PX, LONG_HEIGHT_PX, noise=False, scene="corridor"),
 }
 
 
