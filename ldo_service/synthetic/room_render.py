@@ -56,7 +56,7 @@ class Renderer:
         solids = (*self._room.furniture, *visitors)
         view = RayCaster(self._room.shell, solids, camera, T_world_camera)
         hits = view.cast(u, v)
-        light = self._color(view, solids, u, v, hits)
+        light = self._color(view, solids, hits)
         edge = outline(hits.surface.reshape(camera.height, camera.width)).ravel()
         light[edge] = self._antialiased(view, solids, u[edge], v[edge])
         size = (camera.height, camera.width)
@@ -70,16 +70,14 @@ class Renderer:
     ) -> np.ndarray:
         total = np.zeros((len(u), 3))
         for du, dv in QUARTERS_PX:
-            total += self._color(view, solids, u + du, v + dv, view.cast(u + du, v + dv))
+            total += self._color(view, solids, view.cast(u + du, v + dv))
         return total / len(QUARTERS_PX)
 
-    def _color(
-        self, view: RayCaster, solids: tuple[Solid, ...], u: np.ndarray, v: np.ndarray, hits: Hits
-    ) -> np.ndarray:
+    def _color(self, view: RayCaster, solids: tuple[Solid, ...], hits: Hits) -> np.ndarray:
         """Return the reflected light [P, 3] in 0..1: albedo times diffuse shading."""
-        color = np.empty((len(u), 3))
+        color = np.empty((len(hits.surface), 3))
         for surface, rays in hits.by_surface():
-            point = view.points(u[rays], v[rays], hits.depth_m[rays])
+            point = hits.points(rays)
             footprint_m = hits.depth_m[rays] / view.camera.fx
             if surface < SHELL_FACES:
                 color[rays] = self._wall_color(surface, point, footprint_m)

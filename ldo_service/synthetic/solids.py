@@ -66,7 +66,9 @@ class Solid:
         n = tuple(component * (2 / size) for component, size in zip(n, self.size_m, strict=True))
         length = np.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2])
         x, y, z = (component / length for component in n)
-        axis = np.argmax(np.abs(np.stack([x, y, z])), axis=0)
+        along_x, along_y, along_z = np.abs(x), np.abs(y), np.abs(z)
+        is_x = (along_x >= along_y) & (along_x >= along_z)
+        axis = np.where(is_x, 0, np.where(along_y >= along_z, 1, 2))
         c, s = self.heading
         return (c * x - s * y, s * x + c * y, z), axis
 
@@ -80,10 +82,8 @@ class Solid:
         """
         local = self.point_to_local(point)
         normal, axis = self.normal(local)
-        own = np.stack([q * (size / 2) for q, size in zip(local, self.size_m, strict=True)])
-        rays = np.arange(len(axis))
-        u_m, v_m = own[np.where(axis == 0, 1, 0), rays], own[np.where(axis == 2, 1, 2), rays]
-        return normal, u_m, v_m
+        x, y, z = (q * (size / 2) for q, size in zip(local, self.size_m, strict=True))
+        return normal, np.where(axis == 0, y, x), np.where(axis == 2, y, z)
 
     def corners_m(self) -> np.ndarray:
         """Return the corners [8, 3] of the solid's bounding box in the world."""
@@ -165,9 +165,12 @@ def _upright(v: Vector) -> Vector:
 
 
 def _box_normal(q: Vector) -> Vector:
-    stacked = np.stack(q)
-    main = np.abs(stacked) == np.max(np.abs(stacked), axis=0)
-    x, y, z = np.where(main, np.sign(stacked), 0.0)
+    sizes = [np.abs(component) for component in q]
+    largest = np.maximum(np.maximum(*sizes[:2]), sizes[2])
+    x, y, z = (
+        np.where(size == largest, np.sign(component), 0.0)
+        for size, component in zip(sizes, q, strict=True)
+    )
     return x, y * (x == 0), z * (x == 0) * (y == 0)
 
 

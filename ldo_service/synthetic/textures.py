@@ -10,13 +10,16 @@ import numpy as np
 Color = tuple[float, float, float]
 
 TILE_TEXELS = 256
+# Side of each mipmap level, and the number of texels of all finer levels.
+SIDES = TILE_TEXELS >> np.arange(TILE_TEXELS.bit_length())
+STARTS = (TILE_TEXELS**2 - SIDES**2) // 3 * 4
 
 
 @dataclass(frozen=True, slots=True)
 class Texture:
     """Square tile that repeats, with its mipmap levels."""
 
-    texels: np.ndarray  # Texels [T, 3] in 0..1 of all levels in sequence, level 0 first.
+    texels: np.ndarray  # Channels [3, T] in 0..1 of all levels in sequence, level 0 first.
     size_m: float  # Side of the tile.
 
     def sample(self, u_m: np.ndarray, v_m: np.ndarray, footprint_m: np.ndarray) -> np.ndarray:
@@ -31,29 +34,29 @@ class Texture:
         top = TILE_TEXELS.bit_length() - 1
         level = np.clip(level, 0.0, top)
         lower = np.minimum(level.astype(np.int64), top - 1)
-        weight = (level - lower)[:, None]
+        weight = level - lower
         u, v = u_m / self.size_m, v_m / self.size_m
-        return (1 - weight) * self._at(u, v, lower) + weight * self._at(u, v, lower + 1)
+        fine, coarse = self._at(u, v, lower), self._at(u, v, lower + 1)
+        return ((1 - weight) * fine + weight * coarse).T
 
     def _at(self, u: np.ndarray, v: np.ndarray, level: np.ndarray) -> np.ndarray:
-        """Return bilinearly interpolated colors [P, 3].
+        """Return bilinearly interpolated channels [3, P], which NumPy multiplies by [P] quickly.
 
         Args:
             u: Coordinates [P] along the rows, in tiles.
             v: Coordinates [P] along the columns, in tiles.
             level: Mipmap level [P] of each point, an integer.
         """
-        size = TILE_TEXELS >> level
-        start = (TILE_TEXELS**2 - size**2) // 3 * 4  # Number of texels of all finer levels.
+        size, start = SIDES[level], STARTS[level]
         x, y = u * size - 0.5, v * size - 0.5
         x0, y0 = np.floor(x), np.floor(y)
-        fx, fy = (x - x0)[:, None], (y - y0)[:, None]
+        fx, fy = x - x0, y - y0
         column, row, wrap = x0.astype(np.int64), y0.astype(np.int64), size - 1
         left, right = column & wrap, (column + 1) & wrap
         top, bottom = start + (row & wrap) * size, start + ((row + 1) & wrap) * size
         texel = self.texels.take
-        upper = texel(top + left, 0) * (1 - fx) + texel(top + right, 0) * fx
-        lower = texel(bottom + left, 0) * (1 - fx) + texel(bottom + right, 0) * fx
+        upper = texel(top + left, 1) * (1 - fx) + texel(top + right, 1) * fx
+        lower = texel(bottom + left, 1) * (1 - fx) + texel(bottom + right, 1) * fx
         return upper * (1 - fy) + lower * fy
 
 
@@ -72,7 +75,8 @@ def mipmapped(tile: np.ndarray, size_m: float) -> Texture:
     while len(levels[-1]) > 1:
         a = levels[-1]
         levels.append((a[::2, ::2] + a[1::2, ::2] + a[::2, 1::2] + a[1::2, 1::2]) / 4)
-    return Texture(np.concatenate([level.reshape(-1, 3) for level in levels]), size_m)
+    texels = np.concatenate([level.reshape(-1, 3) for level in levels])
+    return Texture(np.ascontiguousarray(texels.T), size_m)
 
 
 def noise(

@@ -89,7 +89,7 @@ def shoot(objects: Sequence[SceneObject], T_world_camera: np.ndarray, index: int
     v, u = np.divmod(np.arange(CAMERA.width * CAMERA.height), CAMERA.width)
     view = RayCaster(SHELL, tuple(item.solid for item in objects), CAMERA, T_world_camera)
     hits = view.cast(u, v)
-    point = np.stack(view.points(u, v, hits.depth_m))
+    point = np.stack(hits.point)
     paint = np.random.default_rng(5).uniform(60, 200, (6 + 40, 3))[hits.surface]
     pattern = 30 * np.sign(np.sin(9 * point[0]) * np.sin(9 * point[1]) * np.sin(9 * point[2] + 1))
     color = np.clip(paint + pattern[:, None], 0, 255).astype(np.uint8)

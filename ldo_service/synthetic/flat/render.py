@@ -142,7 +142,7 @@ class FlatRenderer:
         view = RayCaster(self._flat.shell, self._table.solids, camera, T_world_camera)
         hits = view.cast(u, v)
         size = (camera.height, camera.width)
-        light = self._reflected(view, u, v, hits)
+        light = self._reflected(view, hits)
         edge = outline(hits.surface.reshape(size)).ravel()
         light[edge] = self._antialiased(view, u[edge], v[edge])
         return FlatRendering(
@@ -159,15 +159,15 @@ class FlatRenderer:
         order = np.argsort(v, kind="stable")
         u, v = u[order], v[order]
         light = np.empty((len(u), 3))
-        light[order] = self._reflected(view, u, v, view.cast(u, v))
+        light[order] = self._reflected(view, view.cast(u, v))
         return light.reshape(-1, len(du), 3).sum(axis=1) / len(du)
 
-    def _reflected(self, view: RayCaster, u: np.ndarray, v: np.ndarray, hits: Hits) -> np.ndarray:
+    def _reflected(self, view: RayCaster, hits: Hits) -> np.ndarray:
         """Return the reflected light [P, 3] in 0..1: albedo times diffuse shading."""
-        light = np.zeros((len(u), 3))
+        light = np.zeros((len(hits.surface), 3))
         for surface, rays in hits.by_surface():
             if surface >= SHELL_FACES:
-                point = view.points(u[rays], v[rays], hits.depth_m[rays])
+                point = hits.points(rays)
                 footprint_m = hits.depth_m[rays] / view.camera.fx
                 light[rays] = self._on_solid(surface - SHELL_FACES, point, footprint_m)
         return np.clip(light, 0.0, 1.0)
