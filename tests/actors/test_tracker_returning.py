@@ -34,6 +34,9 @@ def return_frames(frames: list[FrameRgbd]) -> list[FrameRgbd]:
     ]
 
 
+RoundTrip = tuple[Tracker, list[TrackedPose], list[Keyframe]]
+
+
 def round_trip(
     after: int,
     frames: Many[FrameRgbd],
@@ -41,7 +44,7 @@ def round_trip(
     distortion: np.ndarray | None = None,
     restarts: bool = False,
     forgets_at: int | None = None,
-) -> tuple[Tracker, list[TrackedPose], list[Keyframe]]:
+) -> RoundTrip:
     """Track the frames and then the way back, in a map of the outward keyframes.
 
     Args:
@@ -49,7 +52,7 @@ def round_trip(
         frames: Frames of the outward way.
         return_frames: Frames of the way back.
         distortion: Motion [4, 4] of the first half of the keyframes in the map.
-        restarts: True to restore a new tracker after every fourth frame.
+        restarts: True to restore a new tracker after every fifth frame.
         forgets_at: Frame at which a correction keeps the newest keyframe only.
 
     Returns:
@@ -65,7 +68,7 @@ def round_trip(
     assert list(tracker.handle(correction_to_message(0, 7, T_map))) == []
     returned = []
     for frame in return_frames:
-        if restarts and frame.frame % 4 == 0:
+        if restarts and frame.frame % 5 == 0:
             state, tracker = tracker.snapshot(), Tracker(config_with_reuse(after))
             tracker.restore(decode_state(encode_state(state)))
         returned += tracker.handle(frame)
@@ -76,11 +79,17 @@ def round_trip(
     return tracker, poses, [out for out in returned if isinstance(out, Keyframe)]
 
 
+@pytest.fixture(scope="module")
+def returned(frames, return_frames) -> RoundTrip:
+    """A round trip with reuse; tests must not change its tracker."""
+    return round_trip(1, frames, return_frames)
+
+
 def test_return_makes_a_single_keyframe_measured_against_known_ones(
-    room: Sequence, frames, keyframes, return_frames
+    room: Sequence, frames, keyframes, return_frames, returned: RoundTrip
 ) -> None:
     _, _, without_reuse = round_trip(0, frames, return_frames)
-    tracker, poses, made = round_trip(1, frames, return_frames)
+    tracker, poses, made = returned
     assert len(without_reuse) > 4
     (connecting,) = made
     assert tracker.metrics()["keyframes_reused"] > 2
@@ -110,9 +119,9 @@ def test_return_makes_a_single_keyframe_measured_against_known_ones(
 
 
 def test_odometry_does_not_jump_where_the_camera_returns(
-    room: Sequence, frames, return_frames
+    room: Sequence, frames, returned: RoundTrip
 ) -> None:
-    _, poses, _ = round_trip(1, frames, return_frames)
+    _, poses, _ = returned
     truth = room.truth()
     assert truth is not None
     T_odom = [pose_from_message(pose.T_odom_camera) for pose in poses]

@@ -10,20 +10,21 @@ import numpy as np
 import pytest
 
 import ldo_service
-from ldo_service import Camera, Frame, Pose, Run, Slam, Trajectory, load_config, open_sequence
+from ldo_service import Camera, Frame, Pose, Run, Slam, Trajectory, load_config
 from ldo_service.commands.cli import main
+from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError, DataError, FrameError, StageError
 from ldo_service.runs.summary import Usage
 
 COUNT = 12
 # Files of a run whose content does not depend on the time that the run took.
 FILES = ("config.yaml", "keyframes.json", "loops.json", "map.ply", "trajectory.txt")
+QUICK = {"mapper.iterations": 1}  # Settings of tests that do not look at the map.
 
 
 @pytest.fixture(scope="module")
-def frames() -> list[Frame]:
-    sequence = open_sequence("synthetic:room")
-    return [sequence[index] for index in range(COUNT)]
+def frames(room: Sequence) -> list[Frame]:
+    return [room[index] for index in range(COUNT)]
 
 
 def fed(slam: Slam, frames: list[Frame]) -> list[Pose]:
@@ -57,7 +58,7 @@ def test_folder_has_the_same_bytes_as_that_of_ldo_run(saved: Path, tmp_path: Pat
 
 
 def test_poses_are_read_only_and_end_in_the_trajectory(frames: list[Frame]) -> None:
-    with Slam(frames[0].camera) as slam:
+    with Slam(frames[0].camera, settings=QUICK) as slam:
         poses = fed(slam, frames[:6])
         trajectory = slam.trajectory()
     assert [pose.status for pose in poses] == ["OK"] * 6
@@ -103,7 +104,7 @@ def test_arrays_describe_the_gaussians(finished: Slam) -> None:
 
 
 def test_map_does_not_change_with_later_frames(frames: list[Frame]) -> None:
-    with Slam(frames[0].camera) as slam:
+    with Slam(frames[0].camera, settings=QUICK) as slam:
         fed(slam, frames[:6])
         early = slam.map
         before = early.arrays().means_m.copy()
@@ -112,11 +113,10 @@ def test_map_does_not_change_with_later_frames(frames: list[Frame]) -> None:
         np.testing.assert_array_equal(early.arrays().means_m, before)
 
 
-def test_objects_and_labels_of_a_run_with_a_detector(tmp_path: Path) -> None:
-    sequence = open_sequence("synthetic:room")
-    with Slam(sequence.camera, settings={"detector.model": "demo"}) as slam:
+def test_objects_and_labels_of_a_run_with_a_detector(room: Sequence, tmp_path: Path) -> None:
+    with Slam(room.camera, settings={"detector.model": "demo", **QUICK}) as slam:
         for index in range(30):
-            frame = sequence[index]
+            frame = room[index]
             slam.track(frame.color, frame.depth_m, frame.stamp_ns)
         slam.finish()
     objects, last = slam.objects(), slam.trajectory().T_world_camera[-1][:3, 3]
@@ -156,13 +156,13 @@ class Exported:
 def test_dlpack_buffers_and_integer_depth_give_the_same_poses(frames: list[Frame]) -> None:
     camera = frames[0].camera
     rounded = [np.round(1000 * frame.depth_m).astype(np.uint16) for frame in frames[:4]]
-    with Slam(camera) as slam:
+    with Slam(camera, settings=QUICK) as slam:
         expected = [
             slam.track(frame.color, (depth / np.float32(1000)).astype(np.float32), frame.stamp_ns)
             for frame, depth in zip(frames, rounded, strict=False)
         ]
     for wrap in (Exported, memoryview):
-        with Slam(camera, depth_scale=1000) as slam:
+        with Slam(camera, depth_scale=1000, settings=QUICK) as slam:
             for pose, frame, depth in zip(expected, frames, rounded, strict=False):
                 same = slam.track(wrap(frame.color), wrap(depth), np.int64(frame.stamp_ns))
                 np.testing.assert_allclose(same.T_odom_camera, pose.T_odom_camera, atol=1e-6)
@@ -199,7 +199,7 @@ def test_buffers_may_be_reused_at_once(frames: list[Frame], finished: Slam) -> N
 def test_wrong_frame_names_the_argument_and_tracking_continues(
     frames: list[Frame], change: dict, message: str
 ) -> None:
-    with Slam(frames[0].camera) as slam:
+    with Slam(frames[0].camera, settings=QUICK) as slam:
         fed(slam, frames[:1])
         good = {"color": frames[1].color, "depth": frames[1].depth_m, "stamp_ns": 10**9}
         with pytest.raises(FrameError) as caught:
@@ -208,17 +208,18 @@ def test_wrong_frame_names_the_argument_and_tracking_continues(
         assert slam.track(**good).status == "OK"
 
 
-def test_prior_finds_a_fast_camera_at_once_after_it_was_covered(frames: list[Frame]) -> None:
+def test_prior_finds_a_fast_camera_at_once_after_it_was_covered(
+    room: Sequence, frames: list[Frame]
+) -> None:
     """The camera moves three times as fast, so alignment needs the motion of the other odometry."""
-    sequence = open_sequence("synthetic:room")
-    truth = sequence.truth()
+    truth = room.truth()
     assert truth is not None
     T_other = np.linalg.inv(truth.T_world_camera[5]) @ truth.T_world_camera  # Any other origin.
     mount = {"tracker.T_base_camera.translation_m": [0.1, 0.2, 0.3]}
     covered = range(4, 9)
-    with Slam(sequence.camera, settings=mount) as slam:
+    with Slam(room.camera, settings={**mount, **QUICK}) as slam:
         for k in range(11):
-            frame = sequence[3 * k]
+            frame = room[3 * k]
             images = (frame.color, frame.depth_m)
             if k in covered:
                 images = tuple(map(np.zeros_like, images))
@@ -242,7 +243,7 @@ def test_wrong_prior_is_named_and_tracking_continues(
     frames: list[Frame], prior: object, message: str
 ) -> None:
     first, second = frames[:2]
-    with Slam(first.camera) as slam:
+    with Slam(first.camera, settings=QUICK) as slam:
         slam.track(first.color, first.depth_m, first.stamp_ns)
         with pytest.raises(FrameError, match=message):
             slam.track(second.color, second.depth_m, second.stamp_ns, prior=prior)
@@ -328,7 +329,7 @@ def test_two_objects_side_by_side_do_not_disturb_each_other(
 
 def test_close_ends_all_threads_and_keeps_the_results(frames: list[Frame]) -> None:
     before = set(threading.enumerate())
-    slam = Slam(frames[0].camera)
+    slam = Slam(frames[0].camera, settings=QUICK)
     fed(slam, frames[:3])
     assert set(threading.enumerate()) > before
     slam.close()
@@ -341,7 +342,7 @@ def test_close_ends_all_threads_and_keeps_the_results(frames: list[Frame]) -> No
 
 
 def test_track_after_finish_is_refused(frames: list[Frame]) -> None:
-    with Slam(frames[0].camera) as slam:
+    with Slam(frames[0].camera, settings=QUICK) as slam:
         fed(slam, frames[:2])
         slam.finish()
         slam.finish()
@@ -410,7 +411,7 @@ def test_interrupted_refinement_continues_with_the_next_call(
 def test_second_interrupt_takes_effect_at_once_and_ends_tracking(
     frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with Slam(frames[0].camera) as slam:
+    with Slam(frames[0].camera, settings=QUICK) as slam:
         fed(slam, frames[:2])
         interrupted(monkeypatch, slam, "tick", times=2)
         with pytest.raises(KeyboardInterrupt):
@@ -424,7 +425,7 @@ def test_interrupt_while_closing_leaves_no_thread(
     frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = set(threading.enumerate())
-    slam = Slam(frames[0].camera)
+    slam = Slam(frames[0].camera, settings=QUICK)
     fed(slam, frames[:2])
     interrupted(monkeypatch, slam, "__exit__", times=2)
     with pytest.raises(KeyboardInterrupt):
@@ -436,7 +437,7 @@ def test_interrupt_while_closing_leaves_no_thread(
 def test_failed_actor_ends_tracking_and_keeps_the_results(
     frames: list[Frame], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    with Slam(frames[0].camera) as slam:
+    with Slam(frames[0].camera, settings=QUICK) as slam:
         fed(slam, frames[:4])
 
         def fail(_message: object) -> object:
@@ -457,7 +458,7 @@ def test_failed_actor_ends_tracking_and_keeps_the_results(
 
 
 def test_negative_number_of_iterations_is_refused(frames: list[Frame]) -> None:
-    with Slam(frames[0].camera) as slam:
+    with Slam(frames[0].camera, settings=QUICK) as slam:
         for count in (-1, "5", 1.5):
             with pytest.raises(ConfigError, match="refine_iterations"):
                 slam.finish(refine_iterations=count)  # pyright: ignore[reportArgumentType]
@@ -468,7 +469,7 @@ def test_time_between_frames_does_not_lower_the_frame_rate(
 ) -> None:
     now_s = iter(range(100))
     monkeypatch.setattr(Usage, "now", staticmethod(lambda: Usage(float(next(now_s)), 0.0)))
-    with Slam(frames[0].camera) as slam:
+    with Slam(frames[0].camera, settings=QUICK) as slam:
         fed(slam, frames[:3])  # Each step takes one tick of the clock above.
         next(now_s)
         folder = slam.save(tmp_path / "run")
