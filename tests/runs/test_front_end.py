@@ -156,11 +156,11 @@ def test_failed_run_leaves_no_front_end(
 
 def test_front_end_beyond_the_size_limit_is_removed(room: Sequence, tmp_path: Path) -> None:
     tight = "recording.max_gb=0.0000001"
-    options = job(Rearranged(room, OUT_AND_BACK), tmp_path / "out", tight)
+    options = job(Rearranged(room, OUT_AND_BACK), tmp_path / "out", tight, frames=8)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("ldo_service.recordings.mcap_file.CHECK_EVERY_BYTES", 1000)
         record = run_offline(replace(options, keep_front_end=True), lambda *_: None)
-    assert record.summary["frames"] == len(OUT_AND_BACK)  # The run continues.
+    assert record.summary["frames"] == 8  # The run continues.
     assert not (tmp_path / "out" / FRONT_END).exists()
 
 
@@ -171,7 +171,7 @@ def test_front_end_is_complete_once_the_stream_has_ended(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("ldo_service.runs.offline.OfflineRun.repair", fails)
-    options = job(Rearranged(room, OUT_AND_BACK), tmp_path / "out")
+    options = job(Rearranged(room, OUT_AND_BACK), tmp_path / "out", frames=8)
     with pytest.raises(KeyboardInterrupt):
         run_offline(replace(options, keep_front_end=True), lambda *_: None)
     kept = FrontEnd.open(tmp_path / "out", options.config, options.sequence, options.selection)
