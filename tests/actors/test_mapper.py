@@ -40,6 +40,7 @@ from ldo_service.maps.replica import MapReplica
 from ldo_service.runtime.actor import FlowStatus
 from ldo_service.runtime.delivery_state import LoggedInput, RestoredState, restore_actor
 from ldo_service.schemas import (
+    Array,
     Detection,
     DetectionBoxes,
     Keyframe,
@@ -94,6 +95,25 @@ def shifted(keyframes, xi):
             @ pose_from_message(k.T_odom_keyframe)
             for k in keyframes
         },
+    )
+
+
+@pytest.fixture(scope="module")
+def keyframes(keyframes: list[Keyframe]) -> list[Keyframe]:
+    """The keyframes of the room with every second pixel, which are mapped faster."""
+    return [halved(keyframe) for keyframe in keyframes]
+
+
+def halved(keyframe: Keyframe) -> Keyframe:
+    camera = keyframe.camera
+    half = {name: getattr(camera, name) / 2 for name in ("fx", "fy", "cx", "cy")}
+    size = {"width": camera.width // 2, "height": camera.height // 2}
+    color, depth_m = (array.numpy()[::2, ::2] for array in (keyframe.color, keyframe.depth_m))
+    return msgspec.structs.replace(
+        keyframe,
+        camera=msgspec.structs.replace(camera, **half, **size),
+        color=Array.of(color),
+        depth_m=Array.of(depth_m),
     )
 
 
