@@ -1,6 +1,7 @@
 """The command `ldo info`."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -81,7 +82,7 @@ def test_brackets_in_a_path_are_printed(capsys, tmp_path: Path, room_folder: Pat
     folder = shutil.copytree(room_folder, tmp_path / "q[" / "b]")
     code, out, _ = ldo(capsys, "info", folder, "--probe", "0")
     assert code == 0
-    assert "q[/b]" in out.replace("\n", "")
+    assert "q[/b]" in re.sub(r"[\s│]", "", out)  # A long path is broken anywhere.
 
 
 def test_negative_probe_is_refused(capsys) -> None:
