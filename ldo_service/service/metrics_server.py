@@ -31,6 +31,7 @@ from .metrics import HealthCollector
 
 MAX_CONNECTIONS = 16  # Maximum connections of the metrics server; usually two are in use.
 REQUEST_TIMEOUT_S = 5.0  # Maximum time without data from a client of the metrics server.
+STOP_INTERVAL_S = 0.1  # Interval at which the server looks whether it must stop.
 
 
 class _Server(ThreadingMixIn, WSGIServer):
@@ -41,6 +42,8 @@ class _Server(ThreadingMixIn, WSGIServer):
     """
 
     daemon_threads = True
+    # Linux drops a connection beyond this number, and the client tries again after a second.
+    request_queue_size = 4 * MAX_CONNECTIONS
     _open: deque[socket.socket]
     _open_lock: Lock
 
@@ -104,7 +107,9 @@ def serve_metrics(collector: HealthCollector, port: int, address: str = LOOPBACK
             f"--metrics-port {port}: cannot listen on {address}:{port} ({error.strerror}). "
             "Choose another port, or another address with service.metrics_address."
         ) from error
-    thread = Thread(target=server.serve_forever, name="metrics", daemon=True)
+    thread = Thread(
+        target=server.serve_forever, args=(STOP_INTERVAL_S,), name="metrics", daemon=True
+    )
     thread.start()
     try:
         yield
