@@ -243,10 +243,12 @@ def metric(service: LiveService, actor: str, name: str) -> float:
 
 
 @contextmanager
-def service_with_map(folder: Path, frames: FrameSequence) -> Iterator[LiveService]:
-    """Run a service whose mapper has saved a map of at least eight keyframes."""
+def service_with_map(
+    folder: Path, frames: FrameSequence, keyframes: int = 8
+) -> Iterator[LiveService]:
+    """Run a service whose mapper has saved a map of at least so many keyframes."""
     with live_service(folder, *EVERY_KEYFRAME) as service:
         service.wait_for_actors()
         with service.camera(frames):
-            wait_until(lambda: metric(service, "mapper", "keyframes") >= 8, 60, "a map")
+            wait_until(lambda: metric(service, "mapper", "keyframes") >= keyframes, 60, "a map")
         yield service

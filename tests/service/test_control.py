@@ -79,10 +79,15 @@ def _iterations(service: LiveService) -> float:
 
 
 @pytest.mark.slow
-def test_control_of_unresponsive_actor_exits_with_code_4(tmp_path: Path) -> None:
+def test_unknown_robot_exits_with_code_2_and_unresponsive_actor_with_code_4(
+    tmp_path: Path,
+) -> None:
     arguments = ("--set", "service.control_timeout_s=1", "--set", "service.heartbeat_timeout_s=30")
     with live_service(tmp_path, *arguments) as service:
         service.wait_for_actors()
+        done = ldo_control(service, "pause", "--robot", "r2")
+        assert done.returncode == 2
+        assert "Check the name of the robot" in done.stderr
         stopped = service.health["optimizer"].pid
         os.kill(stopped, signal.SIGSTOP)
         try:
@@ -91,16 +96,3 @@ def test_control_of_unresponsive_actor_exits_with_code_4(tmp_path: Path) -> None
             assert "optimizer did not answer" in done.stderr
         finally:
             os.kill(stopped, signal.SIGCONT)
-
-
-@pytest.mark.slow
-def test_control_of_unknown_robot_exits_with_code_2(tmp_path: Path) -> None:
-    with live_service(tmp_path) as service:
-        service.wait_for_actors()
-        done = subprocess.run(
-            [*LDO, "control", "pause", "--robot", "r2", "--endpoint", service.endpoint],
-            capture_output=True,
-            text=True,
-        )
-        assert done.returncode == 2
-        assert "Check the name of the robot" in done.stderr

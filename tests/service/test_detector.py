@@ -24,8 +24,8 @@ def test_keyframes_get_a_detection_message_also_without_a_network(
     with live_service(tmp_path, *APART, *use) as service:
         with service.client.poller("detection/boxes", DetectionBoxes, keep=64) as inbox:
             service.wait_for_actors()
-            publisher = service.publisher("synthetic:room", "--rate", "15", "--max-frames", "40")
-            service.wait_for_poses(20)
+            publisher = service.publisher("synthetic:room", "--rate", "8", "--max-frames", "40")
+            service.wait_for_poses(12)
             wait_until(lambda: boxes.extend(inbox()) or len(boxes) >= 2, 10, "boxes")
             assert publisher.wait(60) == 0
             facts = service.update_health()["detector"].metrics

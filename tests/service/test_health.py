@@ -50,8 +50,8 @@ def test_prometheus_exports_metrics_of_every_actor(tmp_path: Path) -> None:
     port = free_port()
     with live_service(tmp_path, "--metrics-port", str(port)) as service:
         service.wait_for_actors()
-        publisher = service.publisher("synthetic:room", "--rate", "15", "--max-frames", "30")
-        service.wait_for_poses(20)
+        publisher = service.publisher("synthetic:room", "--rate", "8", "--max-frames", "30")
+        service.wait_for_poses(12)
 
         def text() -> str:
             with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=5) as reply:

@@ -37,7 +37,7 @@ def kill_after_reset_of_tracker(service: LiveService) -> None:
 def test_reset_that_a_kill_interrupts_is_completed_at_the_next_start(
     tmp_path: Path, room: Sequence
 ) -> None:
-    with service_with_map(tmp_path, room) as service:
+    with service_with_map(tmp_path, room, keyframes=4) as service:
         killer = Thread(target=kill_after_reset_of_tracker, args=(service,))
         killer.start()
         with pytest.raises(Exception, match="no service replies"):
