@@ -42,12 +42,14 @@ clean:  ## remove .venv, build and dist
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade "pip>=25.1"
 	@touch $@
 
+# Without build isolation, later builds and the wheel of tests/test_packages.py reuse the objects.
 .venv/installed: .venv/pip $(SOURCES)
-	$(BIN)/python -m pip install --quiet -e .
+	$(BIN)/python -m pip install --quiet --group build
+	$(BIN)/python -m pip install --quiet --no-build-isolation -e .
 	@touch $@
 
 .venv/tests: .venv/installed pyproject.toml
-	$(BIN)/python -m pip install --quiet --group test --group build
+	$(BIN)/python -m pip install --quiet --group test
 	@touch $@
 
 .venv/docs: .venv/installed pyproject.toml

@@ -8,10 +8,11 @@ import tarfile
 import zipfile
 from pathlib import Path
 
+import nanobind
 import pytest
 
 ROOT = Path(__file__).parent.parent
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600), pytest.mark.xdist_group("packages")]
 
 
 def tracked() -> set[str]:
@@ -24,14 +25,32 @@ def tracked() -> set[str]:
     return {name for name in done.stdout.split("\0") if name and (ROOT / name).is_file()}
 
 
-@pytest.fixture(scope="module")
-def packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with a new sdist and the wheel built from it."""
-    out = tmp_path_factory.mktemp("dist")
-    command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out), str(ROOT)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+def build(source: Path, out: Path, *options: str) -> Path:
+    """Build packages of a folder in `out`, and return `out`."""
+    command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(out), *options]
+    done = subprocess.run([*command, str(source)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     return out
+
+
+@pytest.fixture(scope="module")
+def packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a new sdist and a new wheel.
+
+    The wheel is built from the checkout, where the kernels are compiled already.
+    """
+    return build(ROOT, tmp_path_factory.mktemp("dist"), "--sdist", "--wheel")
+
+
+@pytest.fixture(scope="module")
+def unpacked(packages: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of the unpacked sdist."""
+    (sdist,) = packages.glob("*.tar.gz")
+    folder = tmp_path_factory.mktemp("sdist")
+    with tarfile.open(sdist) as archive:
+        archive.extractall(folder, filter="data")
+    (root,) = folder.iterdir()
+    return root
 
 
 def test_wheel_contains_every_module_and_network(packages: Path) -> None:
@@ -59,18 +78,31 @@ def test_wheel_contains_compiled_kernels_and_types_without_sources(packages: Pat
     assert {name.split("/")[0] for name in packed if ".dist-info" not in name} == {"ldo_service"}
 
 
-def test_sdist_contains_all_files_of_a_build(packages: Path) -> None:
-    (sdist,) = packages.glob("*.tar.gz")
-    with tarfile.open(sdist) as archive:
-        packed = {name.split("/", 1)[-1] for name in archive.getnames()}
+def test_sdist_contains_all_files_of_a_build(unpacked: Path) -> None:
     needed = {
         name
         for name in tracked()
         if name.startswith(("ldo_service/", "actors/", "schemas/"))
         or name in ("CMakeLists.txt", "LICENSE", "README.md", "pyproject.toml")
     }
-    assert needed - packed == set()
-    assert not [name for name in packed if name.startswith((".ci", "build/"))]
+    assert {name for name in needed if not (unpacked / name).is_file()} == set()
+    assert [n for n in needed if (unpacked / n).read_bytes() != (ROOT / n).read_bytes()] == []
+    assert not (unpacked / ".ci").exists()
+    assert not (unpacked / "build").exists()
+
+
+def test_sdist_gives_the_same_wheel(packages: Path, unpacked: Path, tmp_path: Path) -> None:
+    """CMake finds all sources in it, and the wheel has the same files beside the kernels."""
+    folders = ("-S", str(unpacked), "-B", str(tmp_path / "build"))
+    variables = (f"-Dnanobind_DIR={nanobind.cmake_dir()}", f"-DPython_EXECUTABLE={sys.executable}")
+    cmake = shutil.which("cmake", path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
+    assert cmake is not None
+    done = subprocess.run([cmake, *folders, *variables], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    build(unpacked, tmp_path / "dist", "--wheel", "-C", "wheel.cmake=false")
+    (wheel,), (other,) = packages.glob("*.whl"), (tmp_path / "dist").glob("*.whl")
+    packed = zipfile.ZipFile(wheel).namelist()
+    assert {n for n in packed if not n.endswith(".so")} == set(zipfile.ZipFile(other).namelist())
 
 
 def without_compiler(folder: Path, *tools: str) -> dict[str, str]:
