@@ -1,9 +1,8 @@
 """Tests of the live service as users see it: processes, sockets and signals."""
 
-import os
-import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -18,7 +17,14 @@ from ldo_service.schemas.topics import MAP_SNAPSHOT, POSE_TRACKED
 from ldo_service.storage.state_contents import read_contents
 from ldo_service.storage.state_store import NEWEST, FolderStore, list_name
 from tests.ports import free_endpoint
-from tests.service.conftest import LDO, PATIENCE, is_running, live_service, wait_until
+from tests.service.conftest import (
+    LDO,
+    PATIENCE,
+    LiveService,
+    is_running,
+    live_service,
+    wait_until,
+)
 
 EXAMPLES = Path(__file__).parent.parent.parent / "examples"
 EVERY_ACTOR = tuple(box.name for box in GRAPH)
@@ -58,62 +64,66 @@ def test_frames_yield_poses_and_a_map(tmp_path: Path) -> None:
         assert "Traceback" not in service.log
 
 
-def test_examples_run_as_printed(tmp_path: Path) -> None:
-    with live_service(tmp_path) as service:
+@pytest.fixture(scope="module")
+def running_service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
+    """Yield a service without frames; tests must not stop it."""
+    with live_service(tmp_path_factory.mktemp("running")) as service:
         service.wait_for_actors()
-        _, package_subscriber, zenoh_subscriber = (
-            service.start(
-                [sys.executable, "-c", _at(service.endpoint, EXAMPLES / name), count],
-                stdout=subprocess.PIPE,
-                text=True,
-            )
-            for name, count in (
-                ("1_publish_a_camera.py", "10000"),
-                ("2_follow_the_pose.py", "5"),
-                ("3_without_our_package.py", "5"),
-            )
-        )
-        for subscriber in (package_subscriber, zenoh_subscriber):
-            printed, _ = subscriber.communicate(timeout=30 * PATIENCE)
-            lines = printed.splitlines()
-            assert len(lines) == 5
-            assert all(line.split()[1] == "OK" for line in lines)
+        yield service
 
 
-def test_odometry_example_delivers_its_poses(tmp_path: Path) -> None:
+def test_used_port_is_reported_without_traceback(running_service: LiveService) -> None:
+    second = subprocess.run(
+        [*LDO, "serve", "--endpoint", running_service.endpoint], capture_output=True, text=True
+    )
+    assert second.returncode == 6
+    assert "another `ldo serve`" in second.stderr
+    assert "Traceback" not in second.stderr
+
+
+def test_odometry_example_delivers_its_poses(running_service: LiveService, tmp_path: Path) -> None:
     poses = tmp_path / "odometry.txt"
     poses.write_text(
         "# stamp tx ty tz qx qy qz qw\n1.00 0 0 0 0 0 0 1\n1.02 0 0 0.01 0 0 0.6 0.8\n"
     )
-    with live_service(tmp_path) as service:
-        service.wait_for_actors()
-        example = _at(service.endpoint, EXAMPLES / "4_publish_odometry.py")
-        done = subprocess.run([sys.executable, "-c", example, str(poses)])
-        assert done.returncode == 0
+    example = _at(running_service.endpoint, EXAMPLES / "4_publish_odometry.py")
+    done = subprocess.run([sys.executable, "-c", example, str(poses)])
+    assert done.returncode == 0
 
-        def delivered_poses() -> int:
-            inputs = service.update_health()["tracker"].inputs
-            return sum(i.delivered for i in inputs if i.topic == "odometry/prior")
+    def delivered_poses() -> int:
+        inputs = running_service.update_health()["tracker"].inputs
+        return sum(i.delivered for i in inputs if i.topic == "odometry/prior")
 
-        wait_until(lambda: delivered_poses() == 2, 10, "both poses are delivered")
-        assert "rejected" not in service.log
+    wait_until(lambda: delivered_poses() == 2, 10, "both poses are delivered")
+    assert "rejected" not in running_service.log
+
+
+def test_examples_run_as_printed(running_service: LiveService) -> None:
+    camera, package_subscriber, zenoh_subscriber = (
+        running_service.start(
+            [sys.executable, "-c", _at(running_service.endpoint, EXAMPLES / name), count],
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        for name, count in (
+            ("1_publish_a_camera.py", "10000"),
+            ("2_follow_the_pose.py", "5"),
+            ("3_without_our_package.py", "5"),
+        )
+    )
+    for subscriber in (package_subscriber, zenoh_subscriber):
+        printed, _ = subscriber.communicate(timeout=30 * PATIENCE)
+        lines = printed.splitlines()
+        assert len(lines) == 5
+        assert all(line.split()[1] == "OK" for line in lines)
+    camera.kill()
+    camera.wait()
 
 
 def _at(endpoint: str, example: Path) -> str:
     """Return the text of an example with the address of the service instead of the default."""
     text = example.read_text().replace("tcp/127.0.0.1:7447", endpoint)
     return text.replace('connect("robot")', f'connect("robot", "{endpoint}")')
-
-
-def test_used_port_is_reported_without_traceback(tmp_path: Path) -> None:
-    with live_service(tmp_path) as service:
-        service.wait_for_actors()
-        second = subprocess.run(
-            [*LDO, "serve", "--endpoint", service.endpoint], capture_output=True, text=True
-        )
-        assert second.returncode == 6
-        assert "another `ldo serve`" in second.stderr
-        assert "Traceback" not in second.stderr
 
 
 @pytest.mark.slow
@@ -181,50 +191,23 @@ def test_child_processes_end_when_the_service_is_killed(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_service_continues_after_each_actor_is_killed(tmp_path: Path) -> None:
-    with live_service(tmp_path, *APART) as service:
-        service.wait_for_actors()
-        publisher = service.publisher("synthetic:tour", "--rate", "4")  # 90 s for seven actors.
-        service.wait_for_poses(10)
-        for actor in EVERY_ACTOR:
-            old = service.update_health()[actor]
-            os.kill(old.pid, signal.SIGKILL)
-            wait_until(
-                lambda a=actor, pid=old.pid: service.update_health()[a].pid != pid,
-                15,
-                f"{actor} comes back",
-            )
-            service.poses()
-            steps = service.health["optimizer"].steps
-            poses = service.wait_for_poses(10)
-            assert sum(pose.status == "OK" for pose in poses) >= 8, f"after {actor}"
-            assert f"{actor}: its process was killed by signal 9" in service.log
-            wait_until(
-                lambda s=steps: service.update_health()["optimizer"].steps != s, 10, "keyframes"
-            )
-        publisher.kill()
-        publisher.wait()
-        assert service.stop() == 0
-
-
-@pytest.mark.slow
 def test_tracking_continues_after_the_publisher_is_restarted(tmp_path: Path) -> None:
     with live_service(tmp_path) as service:
         service.wait_for_actors()
-        first = service.publisher("synthetic:room", "--rate", "15")
-        service.wait_for_poses(20)
+        first = service.publisher("synthetic:room", "--rate", "8")
+        service.wait_for_poses(15)
         first.kill()
         first.wait()
         service.poses()
-        second = service.publisher("synthetic:room", "--rate", "15")
-        poses = service.wait_for_poses(60)
-        assert sum(pose.status == "OK" for pose in poses) >= 50
+        second = service.publisher("synthetic:room", "--rate", "8")
+        poses = service.wait_for_poses(30)
+        assert sum(pose.status == "OK" for pose in poses) >= 25
         second.kill()
         second.wait()
 
 
 @pytest.mark.slow
-def test_slow_subscriber_does_not_delay_poses(tmp_path: Path) -> None:
+def test_slow_subscriber_does_not_delay_poses(tmp_path: Path, room: Sequence) -> None:
     slow_subscriber = (
         "import time, zenoh, json, sys\n"
         "config = zenoh.Config()\n"
@@ -238,6 +221,6 @@ def test_slow_subscriber_does_not_delay_poses(tmp_path: Path) -> None:
     with live_service(tmp_path) as service:
         service.wait_for_actors()
         service.start([sys.executable, "-c", slow_subscriber, service.endpoint])
-        service.publisher("synthetic:tour", "--rate", "15", "--max-frames", "200")
-        poses = service.wait_for_poses(150, timeout_s=40)
-        assert sum(pose.status == "OK" for pose in poses) >= 145
+        with service.camera(room, rate_hz=10):  # Hundreds of messages, which fill its queue.
+            poses = service.wait_for_poses(100, timeout_s=40)
+        assert sum(pose.status == "OK" for pose in poses) >= 96

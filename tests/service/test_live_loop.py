@@ -15,6 +15,8 @@ from ldo_service.conversions.frames import raw_frame_to_message
 from ldo_service.datasets import open_sequence
 from tests.service.conftest import LDO, LiveService, live_service, metric, wait_until
 
+from .test_live import EVERY_ACTOR
+
 pytestmark = pytest.mark.slow
 
 # The camera waits while the mapper is farther behind: a slow machine would make fewer keyframes.
@@ -81,6 +83,7 @@ def test_loop_is_closed_while_the_camera_stands_still_and_replays(tmp_path: Path
         assert "Traceback" not in service.log
     assert shown()["closure"] in shown()["accepted"]
     assert all(isinstance(name, str) and name for name in shown()["names"])
+    assert {path.stem for path in recording.iterdir()} == set(EVERY_ACTOR)
     replay = subprocess.run(
         [*LDO, "replay", str(recording), "--verify"], capture_output=True, text=True, check=False
     )
