@@ -87,8 +87,8 @@ def test_slow_labeller_delays_no_poses(tmp_path: Path) -> None:
         use = [word.replace("url=", f"url={server.url}") for word in slow]
         with live_service(tmp_path, *use) as service:
             service.wait_for_actors()
-            publisher = service.publisher("synthetic:room", "--rate", "10", "--max-frames", "60")
-            poses = service.wait_for_poses(40, timeout_s=30)
+            publisher = service.publisher("synthetic:room", "--rate", "8", "--max-frames", "50")
+            poses = service.wait_for_poses(25, timeout_s=30)
             wait_until(lambda: len(server.requests) > 0, 10, "asked")
             assert publisher.wait(60) == 0
             assert {pose.status for pose in poses} == {"OK"}
