@@ -66,7 +66,7 @@ def test_frames_yield_poses_and_a_map(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def running_service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveService]:
-    """Yield a service without frames; tests must not stop it."""
+    """Yield a service that several tests use in any order; they must not stop it."""
     with live_service(tmp_path_factory.mktemp("running")) as service:
         service.wait_for_actors()
         yield service
@@ -207,20 +207,22 @@ def test_tracking_continues_after_the_publisher_is_restarted(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_slow_subscriber_does_not_delay_poses(tmp_path: Path, room: Sequence) -> None:
+def test_slow_subscriber_does_not_delay_poses(tmp_path: Path) -> None:
+    """If the service waited for the subscriber, a quarter of the frames would have no pose."""
     slow_subscriber = (
         "import time, zenoh, json, sys\n"
         "config = zenoh.Config()\n"
         "config.insert_json5('mode', json.dumps('client'))\n"
         "config.insert_json5('connect/endpoints', json.dumps([sys.argv[1]]))\n"
         "with zenoh.open(config) as session:\n"
-        "    with session.declare_subscriber('ldo/robot/**') as everything:\n"
+        "    queue = zenoh.handlers.FifoChannel(1)\n"
+        "    with session.declare_subscriber('ldo/robot/**', queue) as everything:\n"
         "        for _ in everything:\n"
         "            time.sleep(1)\n"
     )
     with live_service(tmp_path) as service:
         service.wait_for_actors()
         service.start([sys.executable, "-c", slow_subscriber, service.endpoint])
-        with service.camera(room, rate_hz=10):  # Hundreds of messages, which fill its queue.
-            poses = service.wait_for_poses(100, timeout_s=40)
-        assert sum(pose.status == "OK" for pose in poses) >= 96
+        service.publisher("synthetic:room", "--rate", "5", "--max-frames", "100")
+        poses = service.wait_for_poses(85, timeout_s=15)
+        assert sum(pose.status == "OK" for pose in poses) >= 82
