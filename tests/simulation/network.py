@@ -1,9 +1,10 @@
 """Simulated network: links between processes with delay, loss, duplication and partitions."""
 
 import random
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Collection, Sequence
 from contextvars import Context
 from dataclasses import dataclass
+from enum import Enum
 
 from ldo_service.transport.flow_control import data_key, retransmit_key
 from ldo_service.transport.interface import LastValues, OnMessage, OnPresence
@@ -18,6 +19,16 @@ TICK_S = 1e-6  # Minimum time between two messages of a link, so that they stay 
 LEASE_S = 10.0
 DRIVER = Context()  # Context of callbacks that belong to no process.
 DISCONNECTED_AFTER_S = 0.05  # Time until the others notice that a process has ended, seconds.
+# Time from the end of a partition of two hosts until their connections that were broken are open
+# again, seconds: the clients of Zenoh wait up to the maximum between two attempts.
+RECONNECT_S = (0.0, 1.2)
+
+
+class Way(Enum):
+    """Direction between the host of the service and that of the remote actors."""
+
+    OUT = "to the remote actors"
+    BACK = "from the remote actors"
 
 
 @dataclass
@@ -30,7 +41,9 @@ class Disturbance:
         topic: Topic whose messages are disturbed, but not their credits; empty for all messages. A
             congested network drops large messages and delivers small ones.
         loss: Probability that a message is lost.
+        ways: Directions between the two hosts whose messages are disturbed; empty for all messages.
         delay_s: Maximum additional delay, seconds.
+        min_delay_s: Minimum additional delay, seconds.
         duplication: Probability that a message arrives twice.
         reorders: Whether a message may overtake an earlier one.
     """
@@ -38,13 +51,24 @@ class Disturbance:
     source: str = ""
     target: str = ""
     topic: str = ""
+    ways: frozenset[Way] = frozenset()
     loss: float = 0.0
     delay_s: float = 0.0
+    min_delay_s: float = 0.0
     duplication: float = 0.0
     reorders: bool = False
 
-    def concerns(self, source: str, target: str, key: str) -> bool:
-        """Return whether this disturbance concerns messages of a key on a link."""
+    def concerns(self, source: str, target: str, key: str, way: Way | None) -> bool:
+        """Return whether this disturbance concerns messages of a key on a link.
+
+        Args:
+            source: Name of the sending process.
+            target: Name of the receiving process.
+            key: Key of the message.
+            way: Direction of the link; None for a link between processes of one host.
+        """
+        if self.ways:
+            return way in self.ways
         if self.topic:
             return key == data_key(self.topic) or key.startswith(retransmit_key(self.topic))
         return self.source in ("", source) and self.target in ("", target)
@@ -58,7 +82,11 @@ class SimulatedNetwork:
     """
 
     def __init__(
-        self, loop: VirtualLoop, seed: int, observe: Callable[[str, bytes, bytes], None]
+        self,
+        loop: VirtualLoop,
+        seed: int,
+        observe: Callable[[str, bytes, bytes], None],
+        remote: Collection[str] = (),
     ) -> None:
         """Create a network without processes.
 
@@ -66,7 +94,10 @@ class SimulatedNetwork:
             loop: The event loop of all processes.
             seed: Seed of delays and losses.
             observe: Called with key, header and body of each message when it is sent.
+            remote: Names of the processes on the other host.
         """
+        self._remote, self._cut_ways = frozenset(remote), set[Way]()
+        self._host_partitions, self._are_hosts_apart = 0, False
         self.loop, self.rng, self.observe = loop, random.Random(f"{seed} network"), observe
         self.disturbances: list[Disturbance] = []
         self._cut: dict[str, int] = {}  # Number of the partition, by name of the process.
@@ -87,8 +118,49 @@ class SimulatedNetwork:
         self._cut[name] = number = self._partitions
         self.loop.call_later(LEASE_S, self._end_lease, name, number)
 
+    def cut_hosts(self, ways: Collection[Way]) -> None:
+        """Lose all messages between the two hosts in some directions, until `join_hosts`."""
+        self._host_partitions += 1
+        self._cut_ways = set(ways)
+        self.loop.call_later(LEASE_S, self._break_connections, self._host_partitions)
+
+    def _break_connections(self, number: int) -> None:
+        """Close the connections between the hosts, because one of them has heard nothing."""
+        if self._host_partitions == number and self._cut_ways:
+            self._cut_ways, self._are_hosts_apart = set(Way), True
+            self._tell_hosts(is_alive=False)
+
+    def join_hosts(self) -> None:
+        """End the partition between the two hosts; broken connections open a little later."""
+        self._host_partitions += 1
+        if self._are_hosts_apart:
+            number = self._host_partitions
+            self.loop.call_later(self.rng.uniform(*RECONNECT_S), self._reconnect, number)
+        else:
+            self._cut_ways.clear()
+
+    def _reconnect(self, number: int) -> None:
+        if self._host_partitions == number:
+            self._cut_ways.clear()
+            self._are_hosts_apart = False
+            self._tell_hosts(is_alive=True)
+
+    def _tell_hosts(self, *, is_alive: bool) -> None:
+        """Tell each host about the liveliness of the actors of the other one."""
+        for watcher in self.transports:
+            for other in self.transports:
+                if self._way(other.name, watcher.name):
+                    for token in other.tokens:
+                        watcher.notify(token, is_alive=is_alive)
+
+    def _way(self, source: str, target: str) -> Way | None:
+        """Return the direction of a link between the hosts; None for a link in one host."""
+        if (source in self._remote) == (target in self._remote):
+            return None
+        return Way.BACK if source in self._remote else Way.OUT
+
     def heal(self) -> None:
-        """End all partitions and disturbances."""
+        """End all partitions and disturbances, except a partition of the two hosts."""
         over, self._is_lease_over = self._is_lease_over, set()
         self._cut.clear()
         self.disturbances.clear()
@@ -110,6 +182,8 @@ class SimulatedNetwork:
 
     def is_cut(self, source: str, target: str) -> bool:
         """Return whether a partition is between two processes."""
+        if self._way(source, target) in self._cut_ways:
+            return True
         return source != target and (source in self._cut or target in self._cut)
 
     # --- messages -------------------------------------------------------------------------------
@@ -134,11 +208,13 @@ class SimulatedNetwork:
         if self.is_cut(source, target):
             return
         delay_s, copies, reorders = rng.uniform(*DELAY_S), 1, False
+        way = self._way(source, target)
         for disturbance in self.disturbances:
-            if disturbance.concerns(source, target, publisher.key):
+            if disturbance.concerns(source, target, publisher.key, way):
                 if rng.random() < disturbance.loss:
                     return
-                delay_s += disturbance.delay_s * rng.random()
+                longer_s = disturbance.delay_s - disturbance.min_delay_s
+                delay_s += disturbance.min_delay_s + longer_s * rng.random()
                 copies += rng.random() < disturbance.duplication
                 reorders = reorders or disturbance.reorders
         link = transport.number, subscriber[0]

@@ -11,8 +11,7 @@ import random
 import secrets
 import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from types import SimpleNamespace
 from typing import Any
@@ -40,12 +39,12 @@ from ldo_service.runtime.supervision_policy import SupervisionConfig
 from ldo_service.schemas import ControlAnswer, ControlRequest, Message, decode, encode
 from ldo_service.service.state_folder import PAUSE_MARKER, RESET_MARKER, claim_state
 from ldo_service.storage.state_store import FolderStore
-from ldo_service.transport.worker import _settle
 
 from .actors import GRAPH, NAMES, Observer, SimulatedActor
 from .disk import SimulatedDisk
 from .network import DRIVER, SimulatedNetwork, SimulatedTransport
-from .virtual_loop import CURRENT, Process, VirtualLoop, is_current_dead
+from .processes import ChildHandle, NoPipe, SimulatedWorker
+from .virtual_loop import CURRENT, Process, VirtualLoop
 
 # Limits that are shorter than the defaults, so that a run reaches them within seconds.
 SUPERVISION = SupervisionConfig(evict_after_s=2.0, stall_after_s=5.0, backend_stall_after_s=5.0)
@@ -79,6 +78,7 @@ class Machine:
         seed: int,
         violation: Callable[[str], None],
         observe: Callable[[str, bytes, bytes], None],
+        remote: Collection[str] = (),
     ) -> None:
         """Create a machine with an empty disk; `run` starts the service.
 
@@ -87,13 +87,16 @@ class Machine:
             seed: Seed of the layout of processes, of durations and of all random numbers.
             violation: Called with the description of a violated invariant.
             observe: Called with key, header and body of each message when it is sent.
+            remote: Names of the actors that run on another host, each in its own process.
         """
         self.loop, self.rng = loop, random.Random(f"{seed} machine")
         self.violation = violation
-        self.disk, self.network = SimulatedDisk(seed), SimulatedNetwork(loop, seed, observe)
+        self.remote = tuple(name for name in NAMES if name in remote)
+        self.disk = SimulatedDisk(seed)
+        self.network = SimulatedNetwork(loop, seed, observe, self.remote)
         self.syncs = self.rng.random() < 1 / 3  # The setting `service.fsync`.
         layouts = (("optimizer",), ("optimizer",), (), NAMES, ("mapper", "optimizer"))
-        self.children = self.rng.choice(layouts)
+        self.children = tuple(n for n in self.rng.choice(layouts) if n not in self.remote)
         self.actors: dict[str, SimulatedActor] = {}
         self.processes: dict[str, Process] = {}  # The last process of each name.
         self.failures: list[str] = []
@@ -112,6 +115,9 @@ class Machine:
     # --- life of the service --------------------------------------------------------------------
     async def run(self) -> None:
         """Start the service, again and again."""
+        for name in self.remote:
+            process = self.processes[name] = Process(self.loop, name)
+            process.start(self._serve_actor(name, StopRequest()))
         while True:
             process = Process(self.loop, "service")
             self.processes["service"] = process
@@ -171,18 +177,20 @@ class Machine:
         """Do what the main process of the service does; see `Service`."""
         await asyncio.sleep(self.rng.uniform(*START_S))
         with ExitStack() as stack:
-            claim_state(self.disk.path, stack)
+            claim_state(self.disk.path, stack, self.remote)
             transport = self.network.transport("service")
             suspects, children = asyncio.Lock(), dict[str, ChildProcess]()
             runners: list[Runner] = []
-            for actor in finish_order(GRAPH):
+            local = [actor for actor in finish_order(GRAPH) if actor.name not in self.remote]
+            names = [name for name in NAMES if name not in self.remote]
+            for actor in local:
                 if actor.name in self.children:
                     children[actor.name] = self._child(actor.name, transport)
                     runners.append(children[actor.name])
                 else:
                     runners.append(self._stage(actor, transport, suspects, children))
             store = FolderStore(self.disk.path / "state")
-            kept = [actor.name for actor in consumers_first(GRAPH)]
+            kept = [a.name for a in consumers_first(GRAPH) if a.name not in self.remote]
             keeper = GenerationKeeper(CommandSender(transport), store, kept)
             keeping = asyncio.create_task(keeper.run())
             self.control = Control(
@@ -202,7 +210,7 @@ class Machine:
                 keeping.cancel()
                 transport.close()
             try:
-                keep_last(store, NAMES)
+                keep_last(store, names)
             except (OSError, DataError):
                 if not self.disk.is_full and not self.disk.error_probability:
                     raise
@@ -223,13 +231,15 @@ class Machine:
                 children[consumer].kill()
 
         topics = [out.topic.name for out in kind.outputs]
+        is_remote = kind.name in self.remote
+        folder = self.disk.path / ("remote" if is_remote else "state")
         is_source = kind.name in ("frame_source", "tracker")
         markers = [self.disk.path / m for m in (RESET_MARKER, *([PAUSE_MARKER] * is_source))]
         return Stage(
             make,
             transport,
             config=SUPERVISION,
-            store=FolderStore(self.disk.path / "state", syncs=self.syncs),
+            store=FolderStore(folder, syncs=self.syncs or is_remote, has_generations=not is_remote),
             expected={topic: lossless_consumers(GRAPH, topic) for topic in topics},
             with_backlog={topic: consumers_with_backlog(GRAPH, topic) for topic in topics},
             on_evicted=evicted,
@@ -258,7 +268,7 @@ class Machine:
         return ChildHandle(process, stop)
 
     async def _serve_actor(self, name: str, stop: StopRequest) -> None:
-        """Do what the child process of an actor does."""
+        """Do what the child process of an actor does, or the process of a remote actor."""
         await asyncio.sleep(self.rng.uniform(*START_S))
         (kind,) = (kind for kind in GRAPH if kind.name == name)
         transport = self.network.transport(name)
@@ -308,7 +318,7 @@ class Machine:
             return any(p.pid == pid and p.is_frozen for p in self.processes.values())
 
         def worker(name: str, **_options: Any) -> SimulatedWorker:
-            return SimulatedWorker(self, name)
+            return SimulatedWorker(self.loop, lambda: self.duration_s(name))
 
         with (
             self.disk.mounted(),
@@ -326,79 +336,3 @@ class Machine:
             patch.object(shutil, "disk_usage", lambda _: SimpleNamespace(free=1e12)),
         ):
             yield
-
-
-class ChildHandle:
-    """Handle of a child process, with what `ChildProcess` uses of `asyncio.subprocess.Process`."""
-
-    def __init__(self, process: Process, stop: StopRequest) -> None:
-        self._process, self._stop = process, stop
-        self.pid = process.pid
-
-    @property
-    def returncode(self) -> int | None:
-        """Exit code; None while the process runs."""
-        return self._process.exit_code
-
-    async def wait(self) -> int:
-        """Wait for the end of the process, and return its exit code."""
-        await self._process.ended.wait()
-        assert self._process.exit_code is not None
-        return self._process.exit_code
-
-    def terminate(self) -> None:
-        """Request a soft stop (SIGTERM)."""
-        self._stop.request()
-
-    def kill(self) -> None:
-        """Kill the process (SIGKILL)."""
-        self._process.kill()
-
-
-class NoPipe:
-    """Heartbeat pipe of a child process that never holds the interpreter's lock."""
-
-    writer = -1
-
-    def __init__(self, on_beat: Callable[[float], None]) -> None:
-        pass
-
-    def close_writer(self) -> None:
-        """Do nothing."""
-
-    def close(self) -> None:
-        """Do nothing."""
-
-
-class SimulatedWorker:
-    """Thread of an actor; it runs each job after a random delay, between two callbacks."""
-
-    def __init__(self, machine: Machine, name: str) -> None:
-        self._machine, self._name = machine, name
-        self._free_at_s = 0.0
-        self._is_closed = False
-
-    def submit(self, job: Callable[..., Any], *args: Any) -> "Future[Any]":
-        """Queue a job, and return its future."""
-        future: Future[Any] = Future()
-        if self._is_closed or is_current_dead():
-            future.cancel()
-            return future
-
-        def work() -> None:
-            if not is_current_dead() and future.set_running_or_notify_cancel():
-                _settle(future, lambda: job(*args))
-
-        loop = self._machine.loop
-        start_s = max(self._free_at_s, loop.time())
-        self._free_at_s = start_s + self._machine.duration_s(self._name)
-        loop.call_at(self._free_at_s, work)
-        return future
-
-    async def run(self, job: Callable[..., Any], *args: Any) -> Any:
-        """Run a job, and wait for its result."""
-        return await asyncio.wrap_future(self.submit(job, *args))
-
-    def close(self) -> None:
-        """Take no more jobs."""
-        self._is_closed = True

@@ -52,6 +52,10 @@ class Report:
     digest: int = 0  # Checksum of all messages with their times.
     virtual_s: float = 0.0
     recovery_s: float = 0.0  # Time from the end of all faults to a new message on each link.
+    # Time from the end of all faults to a message on each link between two hosts, and maximum time
+    # between two poses; measured by `two_hosts` only.
+    resumed_s: float = 0.0
+    pose_gap_s: float = 0.0
     callbacks: int = 0
     keyframes: int = 0
 
@@ -59,10 +63,12 @@ class Report:
 class Simulation:
     """One run."""
 
-    def __init__(self, loop: VirtualLoop, seed: int, only: Sequence[str] = ()) -> None:
+    def __init__(
+        self, loop: VirtualLoop, seed: int, only: Sequence[str] = (), remote: Sequence[str] = ()
+    ) -> None:
         self._loop = loop
         self.report = Report(seed)
-        self._machine = Machine(loop, seed, self._violation, self._observe)
+        self._machine = Machine(loop, seed, self._violation, self._observe, remote)
         self._faults = Faults(self._machine, seed, only)
         self._machine.on_lost_state = self._forget
         self._recorders: dict[int, MessageRecorder] = {}
@@ -124,15 +130,20 @@ class Simulation:
                 await camera
                 await self._check_drained()
             finally:
-                running.cancel()
-                for process in list(machine.processes.values()):
-                    process.kill()
-                self.report.faults = self._faults.done + machine.failures
-                self.report.violations += self._loop.errors
-                others = asyncio.all_tasks() - {asyncio.current_task()}
-                for task in others:
-                    task.cancel()
-                await asyncio.gather(*others, return_exceptions=True)
+                await self._end(running)
+
+    async def _end(self, running: asyncio.Task[None]) -> None:
+        """Kill all processes, cancel all tasks, and complete the report."""
+        machine = self._machine
+        running.cancel()
+        for process in list(machine.processes.values()):
+            process.kill()
+        self.report.faults += self._faults.done + machine.failures
+        self.report.violations += self._loop.errors
+        others = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in others:
+            task.cancel()
+        await asyncio.gather(*others, return_exceptions=True)
         self.report.virtual_s, self.report.callbacks = self._loop.time(), self._loop.callbacks
 
     async def _film(self) -> None:

@@ -17,6 +17,7 @@ from ldo_service.runtime.state_saver import StateSaver
 from ldo_service.storage.state_store import State
 from ldo_service.transport.flow_control import Credit
 
+from . import two_hosts
 from .simulation import simulate
 
 SEEDS, SEEDS_PER_TEST = 100, 20
@@ -47,6 +48,12 @@ def test_seed_repeats_its_run_in_another_process() -> None:
     )  # fmt: skip
     assert int(again.stdout) == simulate(seed).digest
     assert simulate(seed + 1).digest != simulate(seed).digest
+
+
+def test_links_between_two_hosts_continue_within_5_s_after_a_bad_network() -> None:
+    reports = [two_hosts.simulate(seed, max_duration_s=40.0) for seed in range(5)]
+    assert [report for report in reports if report.violations] == []
+    assert min(report.keyframes for report in reports) > 20
 
 
 def is_reported(violation: str, only: str) -> bool:
