@@ -89,7 +89,7 @@ class Worker:
         while entry := self._jobs.get():
             future, job = entry
             if future.set_running_or_notify_cancel():
-                _settle(future, job)
+                settle(future, job)
             del entry, future, job  # An idle thread must keep no references.
 
 
@@ -108,7 +108,8 @@ def _lower_priority(name: str, nice: int) -> None:
         )  # fmt: skip
 
 
-def _settle(future: Future[Any], job: Callable[[], Any]) -> None:
+def settle(future: Future[Any], job: Callable[[], Any]) -> None:
+    """Run a job, and give its result or its exception to a future."""
     try:
         result = job()
     except (StopIteration, GeneratorExit, KeyboardInterrupt, SystemExit) as error:

@@ -6,7 +6,7 @@ from concurrent.futures import Future
 from typing import Any
 
 from ldo_service.runtime.supervision import StopRequest
-from ldo_service.transport.worker import _settle
+from ldo_service.transport.worker import settle
 
 from .virtual_loop import Process, VirtualLoop, is_current_dead
 
@@ -76,7 +76,7 @@ class SimulatedWorker:
 
         def work() -> None:
             if not is_current_dead() and future.set_running_or_notify_cancel():
-                _settle(future, lambda: job(*args))
+                settle(future, lambda: job(*args))
 
         start_s = max(self._free_at_s, self._loop.time())
         self._free_at_s = start_s + self._duration_s()
