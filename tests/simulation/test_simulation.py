@@ -13,6 +13,7 @@ from ldo_service.runtime.actor import Actor
 from ldo_service.runtime.consumers import Consumers
 from ldo_service.runtime.control import Control
 from ldo_service.runtime.delivery_state import RestoredState
+from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.state_saver import StateSaver
 from ldo_service.storage.state_store import State
 from ldo_service.transport.flow_control import Credit
@@ -51,9 +52,18 @@ def test_seed_repeats_its_run_in_another_process() -> None:
 
 
 def test_links_between_two_hosts_continue_within_5_s_after_a_bad_network() -> None:
-    reports = [two_hosts.simulate(seed, max_duration_s=40.0) for seed in range(5)]
+    reports = [two_hosts.simulate(seed, max_duration_s=30.0) for seed in range(5)]
     assert [report for report in reports if report.violations] == []
     assert min(report.keyframes for report in reports) > 20
+
+
+def test_links_between_two_hosts_without_retransmission_are_found(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Outlet, "REPEAT_AFTER_S", 1e9)
+    violations = two_hosts.simulate(4, max_duration_s=30.0).violations
+    assert any("after healing: " in violation for violation in violations)
+    assert any("after the last frame" in violation for violation in violations)
 
 
 def is_reported(violation: str, only: str) -> bool:
