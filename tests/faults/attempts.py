@@ -73,12 +73,17 @@ def main() -> None:
     given = parser.parse_args()
     table = {a: names for a, names in attempts(PAGE.read_text()).items() if given.word in a}
     files, outcomes = files_of_tests(), _Outcomes()
+    if not table:
+        parser.error(f"no attempt of {PAGE.name} contains {given.word!r}")
     tests = sorted({f"{p}::{n}" for names in table.values() for n in names for p in files[n]})
-    pytest.main([*tests, "-q", "-m", "slow or not slow", "--no-header"], plugins=[outcomes])
+    exit_code = pytest.main(
+        [*tests, "-q", "-m", "slow or not slow", "--no-header"], plugins=[outcomes]
+    )
     verdicts = {a: verdict(outcomes.of[name] for name in names) for a, names in table.items()}
     for attempt, result in verdicts.items():
         print(f"{result:<9} {attempt}")
-    raise SystemExit("SEEN" in verdicts.values())
+    # Pytest has another exit code if it could not run the tests.
+    raise SystemExit("SEEN" in verdicts.values() or exit_code not in (0, 1))
 
 
 if __name__ == "__main__":
