@@ -2,7 +2,10 @@
 
 The kernel of a test machine may have no netem. A thread therefore forwards the packets between two
 TUN devices, one in each namespace. TCP of the kernel sees real losses and real delays. This needs
-root, `ip` and /dev/net/tun.
+root, `ip`, `setpriv` and /dev/net/tun.
+
+The end of the program ends the processes in the namespaces, even after SIGKILL. The namespaces
+remain only after SIGKILL, and the next program deletes them.
 """
 
 import ctypes
@@ -12,14 +15,16 @@ import os
 import random
 import select
 import shutil
+import signal
 import struct
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from threading import Event, Thread
+from threading import Event, Thread, current_thread, main_thread
 
 # Names of the namespaces, which differ between programs that run at once.
 ROBOT, HOST = f"ldo-robot-{os.getpid()}", f"ldo-host-{os.getpid()}"
@@ -33,7 +38,7 @@ MAX_QUEUED_BYTES = 256_000
 
 
 class NamespacesUnavailable(Exception):
-    """Error of a machine without root, `ip` or /dev/net/tun."""
+    """Error of a machine without root, `ip`, `setpriv` or /dev/net/tun."""
 
 
 @dataclass
@@ -157,9 +162,15 @@ def two_namespaces(seed: int) -> Iterator[BadNetwork]:
     Raises:
         NamespacesUnavailable: This machine cannot make them.
     """
-    if os.geteuid() != 0 or not shutil.which("ip") or not Path("/dev/net/tun").exists():
-        raise NamespacesUnavailable("root, ip and /dev/net/tun are needed")
+    programs = shutil.which("ip") and shutil.which("setpriv")
+    if os.geteuid() != 0 or not programs or not Path("/dev/net/tun").exists():
+        raise NamespacesUnavailable(
+            "two network namespaces need root, the programs ip (iproute2) and setpriv "
+            "(util-linux), and /dev/net/tun (modprobe tun)"
+        )
+    delete_namespaces_of_ended_programs()
     with ExitStack() as stack:
+        stack.enter_context(_exit_on_signals())
         devices = []
         try:
             for number, (name, address) in enumerate(ADDRESSES.items()):
@@ -186,6 +197,37 @@ def two_namespaces(seed: int) -> Iterator[BadNetwork]:
 
 def _ip(*arguments: str) -> None:
     subprocess.run(["ip", *arguments], check=True, capture_output=True)
+
+
+def delete_namespaces_of_ended_programs() -> None:
+    """Delete the namespaces of programs that could not delete them, because they were killed."""
+    for path in Path("/run/netns").glob("ldo-*"):
+        name, _, pid = path.name.rpartition("-")
+        if name in ("ldo-robot", "ldo-host") and not Path("/proc", pid).exists():
+            subprocess.run(["ip", "netns", "del", path.name], check=False)
+
+
+@contextmanager
+def _exit_on_signals() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end the program as an exception does, so that it cleans up."""
+    if current_thread() is not main_thread():
+        yield
+        return
+    signals = (signal.SIGTERM, signal.SIGHUP)
+    previous = [signal.signal(s, lambda number, _: sys.exit(128 + number)) for s in signals]
+    try:
+        yield
+    finally:
+        for number, handler in zip(signals, previous, strict=True):
+            signal.signal(number, handler)
+
+
+def command_in(namespace: str, *command: str) -> list[str]:
+    """Return a command that runs another one in a namespace.
+
+    The kernel kills that process when the calling thread ends.
+    """
+    return ["setpriv", "--pdeathsig", "KILL", "ip", "netns", "exec", namespace, *command]
 
 
 def enter_namespace(name: str) -> None:

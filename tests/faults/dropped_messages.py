@@ -23,7 +23,15 @@ import zenoh
 
 from ldo_service.transport.endpoint import CLOSED
 
-from .bad_network import ADDRESSES, HOST, ROBOT, enter_namespace, two_namespaces
+from .bad_network import (
+    ADDRESSES,
+    HOST,
+    ROBOT,
+    NamespacesUnavailable,
+    command_in,
+    enter_namespace,
+    two_namespaces,
+)
 
 ENDPOINT = f"tcp/{ADDRESSES[ROBOT]}:7447"
 DROP = "transport/link/tx/queue/congestion_control/drop"
@@ -57,7 +65,7 @@ class Subscriber:
     """Program on the other host that counts messages."""
 
     def __init__(self, stack: ExitStack) -> None:
-        command = ["ip", "netns", "exec", HOST, sys.executable, "-c", SUBSCRIBER, ENDPOINT]
+        command = command_in(HOST, sys.executable, "-c", SUBSCRIBER, ENDPOINT)
         self.process = subprocess.Popen(command, stdin=-1, stdout=-1, text=True, bufsize=1)
         stack.callback(lambda: (self.process.kill(), self.process.wait()))
         self._line()
@@ -134,7 +142,10 @@ def main() -> None:
     parser.add_argument("--fragments-us", type=int, default=50_000)
     parser.add_argument("--block", action="store_true")
     given = parser.parse_args()
-    run((given.wait_us, given.fragments_us), given.block)
+    try:
+        run((given.wait_us, given.fragments_us), given.block)
+    except NamespacesUnavailable as error:
+        raise SystemExit(f"not run: {error}") from error
 
 
 if __name__ == "__main__":

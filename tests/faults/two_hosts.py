@@ -3,9 +3,10 @@
     .venv/bin/python -m tests.faults.two_hosts two_hosts.jsonl --trials 20 --seed 1
 
 The program needs root: it makes two network namespaces (`bad_network`). In each trial the network
-is bad for 10 to 25 s, and then heals. After that, each actor must go on, and each lossless link
-between the hosts must have passed on each message once. Afterwards, the program measures commands
-beside readers of the map, of which some are stopped.
+is bad for 10 to 25 s, and then heals. After that, each actor must go on, and as many messages must
+have been handled as were sent, on each lossless link between the hosts. Afterwards, the program
+measures commands beside readers of the map, of which some are stopped. It prints medians and
+maxima, and its exit code is 1 after a violation.
 """
 
 import argparse
@@ -18,7 +19,9 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
+from math import inf
 from pathlib import Path
+from statistics import median
 from tempfile import mkdtemp
 from typing import Any
 
@@ -28,7 +31,16 @@ from ldo_service.errors import ConfigError
 from ldo_service.runtime.actor_graph import lossless, producers
 from ldo_service.schemas import Health, TrackedPose
 
-from .bad_network import ADDRESSES, HOST, ROBOT, BadNetwork, enter_namespace, two_namespaces
+from .bad_network import (
+    ADDRESSES,
+    HOST,
+    ROBOT,
+    BadNetwork,
+    NamespacesUnavailable,
+    command_in,
+    enter_namespace,
+    two_namespaces,
+)
 from .camera import CameraStream, frames
 
 REMOTE = ("optimizer", "detector", "vlm_labeller")
@@ -41,7 +53,7 @@ RATE_HZ = 4.0
 PATIENCE_S = 60.0  # Time limit of a start on a busy machine.
 BAD_S, LOSS, DELAY_S, CUT_S = (10.0, 25.0), (0.01, 0.2), (0.05, 0.5), (2.0, 15.0)
 CUTS = ("none", "to the host", "from the host", "both", "resets")
-HANDLED_WITHIN_S = 60.0
+RESUMED_WITHIN_S, HANDLED_WITHIN_S = 5.0, 60.0
 READERS, STOPPED, COMMANDS = 20, 3, 120
 
 # Each lossless link between the hosts: producer, topic and consumer.
@@ -59,13 +71,19 @@ READER = """
 import sys, time
 from threading import Thread
 from ldo_service.client import connect
-def read():
+counts = [0] * int(sys.argv[2])
+def read(number):
     with connect("robot", sys.argv[1]) as client:
         while True:
-            client.latest("map/snapshot", 30.0)
+            counts[number] += bool(client.latest("map/snapshot", 30.0))
             time.sleep(1.0)
-for _ in range(int(sys.argv[2])):
-    Thread(target=read, daemon=True).start()
+for number in range(len(counts)):
+    Thread(target=read, args=(number,), daemon=True).start()
+until_s = time.monotonic() + 60.0
+while not all(counts):
+    if time.monotonic() > until_s:
+        sys.exit("no map")
+    time.sleep(0.1)
 print("reading", flush=True)
 sys.stdin.readline()
 """
@@ -199,6 +217,29 @@ def draw(seed: int, count: int) -> list[Trial]:
     return trials
 
 
+def summary(trials: list[Trial]) -> str:
+    """Return the lines of a table: median and maximum times of each kind of cut."""
+    lines = []
+    for cut in CUTS:
+        done = [trial for trial in trials if trial.cut == cut]
+        if done:
+            resumed_s = [trial.resumed_s if trial.resumed_s >= 0 else inf for trial in done]
+            handled_s = [trial.handled_s if trial.handled_s >= 0 else inf for trial in done]
+            lines.append(
+                f"{cut}: {len(done)} trials, results again after {median(resumed_s):.1f} / "
+                f"{max(resumed_s):.1f} s, all messages handled after {median(handled_s):.1f} / "
+                f"{max(handled_s):.1f} s"
+            )
+    soon = sum(0 <= trial.resumed_s <= RESUMED_WITHIN_S for trial in trials)
+    failed = sum(bool(trial.violations) for trial in trials)
+    pose_gap_s = max((trial.pose_gap_s for trial in trials), default=0.0)
+    lines.append(
+        f"{len(trials)} trials, {soon} with results within {RESUMED_WITHIN_S:g} s, {failed} with "
+        f"violations; poses at most {pose_gap_s:.1f} s apart"
+    )
+    return "\n".join(lines)
+
+
 class Hosts:
     """Processes of the service on both hosts."""
 
@@ -207,7 +248,7 @@ class Hosts:
 
     def start(self, namespace: str, *arguments: str, **options: Any) -> "subprocess.Popen[str]":
         """Start a Python program in a namespace."""
-        command = ["ip", "netns", "exec", namespace, sys.executable, *arguments]
+        command = command_in(namespace, sys.executable, *arguments)
         process = subprocess.Popen(command, text=True, **options)
         self._stack.callback(lambda: (process.kill(), process.wait()))
         return process
@@ -240,10 +281,10 @@ def measure_commands(hosts: Hosts, client: Client, network: BadNetwork) -> dict[
         hosts.start(HOST, "-c", READER, ENDPOINT, str(count), stdin=-1, stdout=-1)
         for count in (READERS - STOPPED, STOPPED)
     ]
-    for reader in readers:
+    for reader in readers:  # Each reader has read the map once.
         assert reader.stdout
-        reader.stdout.readline()
-    time.sleep(5.0)
+        if reader.stdout.readline() != "reading\n":
+            raise SystemExit("a reader of the map ended")
     readers[1].send_signal(signal.SIGSTOP)
     took_s, refused = [], 0
     for number in range(COMMANDS):
@@ -298,7 +339,14 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
-    run(given.out, draw(given.seed, given.trials), given.seed)
+    trials = draw(given.seed, given.trials)
+    try:
+        run(given.out, trials, given.seed)
+    except NamespacesUnavailable as error:
+        raise SystemExit(f"not run: {error}") from error
+    finally:
+        print(summary([trial for trial in trials if trial.poses]))
+    raise SystemExit(any(trial.violations for trial in trials))
 
 
 if __name__ == "__main__":
