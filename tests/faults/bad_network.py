@@ -187,6 +187,7 @@ def two_namespaces(seed: int) -> Iterator[BadNetwork]:
                 _ip(*inside, "address", "add", f"{address}/24", "dev", link)
                 _ip(*inside, "link", "set", link, "up")
                 _ip(*inside, "link", "set", "lo", "up")
+                subprocess.run(command_in(name, "true"), check=True, capture_output=True)
         except (OSError, subprocess.CalledProcessError) as error:
             raise NamespacesUnavailable(f"network namespaces cannot be made: {error}") from error
         network = BadNetwork(seed, (devices[0], devices[1]))

@@ -12,6 +12,7 @@ maxima, and its exit code is 1 after a violation.
 import argparse
 import json
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -331,6 +332,10 @@ def run(out: Path, trials: list[Trial], seed: int) -> None:
         commands = measure_commands(hosts, client, network)
         print(json.dumps(commands), file=lines, flush=True)
         print(commands, flush=True)
+    if any(trial.violations for trial in trials):
+        print(f"logs and states: {folder}")
+    else:
+        shutil.rmtree(folder)
 
 
 def main() -> None:
@@ -345,7 +350,8 @@ def main() -> None:
     except NamespacesUnavailable as error:
         raise SystemExit(f"not run: {error}") from error
     finally:
-        print(summary([trial for trial in trials if trial.poses]))
+        if done := [trial for trial in trials if trial.messages]:
+            print(summary(done), flush=True)
     raise SystemExit(any(trial.violations for trial in trials))
 
 
