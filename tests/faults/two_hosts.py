@@ -306,9 +306,9 @@ def measure_commands(hosts: Hosts, client: Client, network: BadNetwork) -> dict[
 
 
 def run(out: Path, trials: list[Trial], seed: int) -> None:
-    folder = Path(mkdtemp(prefix="ldo-hosts-"))
     with ExitStack() as stack, out.open("w") as lines:
         network = stack.enter_context(two_namespaces(seed))
+        folder = Path(mkdtemp(prefix="ldo-hosts-"))
         hosts = Hosts(folder, stack)
         # Sessions of this program, and the threads of the camera, are on the robot.
         enter_namespace(ROBOT)
