@@ -18,6 +18,7 @@ from ldo_service.schemas import (
     Message,
     TrackedPose,
 )
+from tests.actors.loop_walks import DRIFT, FIRST_WALK, LONG_AFTER, SECOND_WALK, keyframes_of
 
 
 def camera_messages(sequence: Sequence, indices: Iterable[int]) -> list[CameraRgbd]:
@@ -56,3 +57,14 @@ def tracked(frames: list[FrameRgbd]) -> list[TrackedPose | Keyframe]:
 @pytest.fixture(scope="session")
 def keyframes(tracked: list[TrackedPose | Keyframe]) -> list[Keyframe]:
     return [message for message in tracked if isinstance(message, Keyframe)]
+
+
+@pytest.fixture(scope="session")
+def first_walk(room: Sequence) -> list[Keyframe]:
+    return keyframes_of(room, FIRST_WALK, 0, 0)
+
+
+@pytest.fixture(scope="session")
+def second_walk(room: Sequence) -> list[Keyframe]:
+    """Return keyframes of the path of the first walk, long after it and with drifted odometry."""
+    return keyframes_of(room, SECOND_WALK, len(FIRST_WALK), LONG_AFTER, DRIFT)

@@ -11,28 +11,9 @@ from ldo_service.geometry import se3
 from ldo_service.schemas import Array, Keyframe, MapObject, MapObjects, encode
 from ldo_service.storage.state_codec import decode_state, encode_state
 from tests.actors.conftest import handle_all
-from tests.actors.test_loop_closer import (
-    DRIFT,
-    FIRST_WALK,
-    LONG_AFTER,
-    SECOND_WALK,
-    candidates,
-    closures,
-    keyframes_of,
-    with_empty_detections,
-)
+from tests.actors.loop_walks import DRIFT, candidates, closures, with_empty_detections
 
 BALL_M = 0.12  # Radius of an object.
-
-
-@pytest.fixture(scope="module")
-def first_walk(room) -> list[Keyframe]:
-    return keyframes_of(room, FIRST_WALK, 0, 0)
-
-
-@pytest.fixture(scope="module")
-def second_walk(room) -> list[Keyframe]:
-    return keyframes_of(room, SECOND_WALK, len(FIRST_WALK), LONG_AFTER, DRIFT)
 
 
 def map_objects(*centers_m: np.ndarray, name: str = "vase", size_m: float = BALL_M) -> MapObjects:
