@@ -23,14 +23,14 @@ class RetrievalSettings:
     # alone (semantic), or by images alone (geometric). The modes semantic and geometric serve for
     # evaluation.
     mode: Literal["two_stage", "semantic", "geometric"] = "two_stage"
-    # Minimum number of camera frames between the two subgraphs of a loop closure (LDO-SLAM paper,
-    # III.C).
+    # The two keyframes of a loop closure are more than this number of camera frames apart (LDO-SLAM
+    # paper, III.C).
     min_gap_frames: NonNegativeInt = 100
     # Maximum number of subgraphs, of up to 5 keyframes each, in the place database. Beyond this
     # number, subgraphs are removed evenly along the path.
     max_subgraphs: Annotated[int, Meta(ge=3)] = 1000
     # Maximum number of similar subgraphs that are verified, the most similar ones first. This is K
-    # (LDO-SLAM paper, III.C).
+    # (LDO-SLAM paper, III.C). If all fail, the nearest other subgraph in the map is verified.
     max_candidates: PositiveInt = advanced(5)
     # Minimum similarity of the labels of two subgraphs. This is theta_loop (LDO-SLAM paper, III.C).
     min_similarity: Ratio = advanced(0.75)

@@ -13,9 +13,9 @@ import numpy as np
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
-from ldo_service.tracking.motion import image_motion_rad
+from ldo_service.tracking.motion import image_motion_rad, image_motions_rad
 
-from .subgraph import SubgraphKeyframe
+from .subgraph import Subgraph, SubgraphKeyframe
 from .verification import LoopHypothesis
 
 
@@ -81,9 +81,7 @@ class ConsistencyChecker:
         """
         if new.keyframe not in self._poses:
             return np.ones(len(old), bool)
-        root = self._root(new.place.submap)
-        known = self._poses.are_known([view.keyframe for view in old])
-        known &= np.array([self._root(view.place.submap) == root for view in old], bool)
+        known = self._are_known(old, new.place.submap)
         may = ~known
         at = np.flatnonzero(known)
         views, config = [old[k] for k in at.tolist()], self._config
@@ -98,6 +96,40 @@ class ConsistencyChecker:
             turn_rad <= config.turn_rad + config.turn_rad_per_m * way_m + config.view_rad
         )
         return may
+
+    def image_motions(
+        self, old: Sequence[Subgraph], new: Subgraph, is_possible: np.ndarray
+    ) -> np.ndarray:
+        """Return how far each of S stored subgraphs is from a new one in the map, [S] rad.
+
+        This is the smallest rotation plus parallax between a stored keyframe of the one and a
+        keyframe of the other. It is infinite for subgraphs that are not possible, and for those
+        without a known relative pose.
+
+        Args:
+            old: Stored subgraphs.
+            new: New subgraph.
+            is_possible: Which subgraphs to compare, [S] bool.
+        """
+        motions_rad = np.full(len(old), np.inf)
+        T_new = self._poses.of([view.keyframe for view in new.views])
+        at = [k for k in np.flatnonzero(is_possible).tolist() for _ in old[k].views]
+        views = [view for k in np.flatnonzero(is_possible).tolist() for view in old[k].views]
+        known = np.flatnonzero(self._are_known(views, new.submap))
+        if len(known) and len(T_new):
+            views = [views[k] for k in known.tolist()]
+            T_old = self._poses.of([view.keyframe for view in views])
+            depth_m = np.array([view.place.median_depth_m for view in views])
+            T_old_new = se3.inverse(T_old)[:, None] @ T_new
+            nearest_rad = image_motions_rad(T_old_new, depth_m[:, None]).min(axis=1)
+            np.minimum.at(motions_rad, np.array(at)[known], nearest_rad)
+        return motions_rad
+
+    def _are_known(self, views: Sequence[SubgraphKeyframe], submap: int) -> np.ndarray:
+        """Return which keyframes have a pose in the map that contains a submap, [n] bool."""
+        root = self._root(submap)
+        known = self._poses.are_known([view.keyframe for view in views])
+        return known & np.array([self._root(view.place.submap) == root for view in views], bool)
 
     def check_drift(self, proposal: LoopHypothesis) -> LoopHypothesis:
         """Check a loop hypothesis, and return it with a `rejected_reason` if it is rejected.

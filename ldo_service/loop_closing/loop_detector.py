@@ -91,7 +91,11 @@ class LoopDetector:
         self._path_m = 0.0
         self._last: tuple[int, np.ndarray] | None = None  # Submap and T_odom_keyframe.
         self._verifier = Verifier(
-            config.pyramid, config.align, config.features, config.verification
+            config.pyramid,
+            config.align,
+            config.features,
+            config.verification,
+            config.retrieval.exclude_frames,
         )
         self._presence = ObjectPresenceChecker()
 
@@ -218,16 +222,20 @@ class LoopDetector:
     ) -> list[LoopCandidateResult]:
         """Return all loop candidates of a new subgraph, with the results of their verification.
 
-        All candidates are verified. Those that fail make no other candidate ambiguous. Of those
-        that pass, the one with the most inliers becomes the loop closure; the others are rejected.
+        All similar subgraphs are verified. Those that fail make no other candidate ambiguous. Of
+        those that pass, the one with the most inliers becomes the loop closure; the others are
+        rejected. The nearest subgraph in the map is verified if no similar one passes.
         """
         known = ConsistencyChecker(poses, merged, self._config.plausibility)
         is_possible = known.possible_matches(
             [old.views[0] for old in self.subgraphs], new.views[-1]
         )
-        likely = self._memory.query(new, is_possible)
+        motion_rad = known.image_motions(self.subgraphs, new, is_possible)
+        likely = self._memory.query(new, is_possible, motion_rad)
         checks: list[VerificationResult] = []
         for like in likely:
+            if like.is_near and any(check.closure for check in checks):
+                break
             proposal = known.check_drift(self._proposal(like.subgraph, new, known))
             check = self._check(proposal)
             if check.closure and objects and self._config.stages == "two_stage":
@@ -248,7 +256,7 @@ class LoopDetector:
                 like,
                 check if k == best else _rejected(check, "another candidate closed the loop"),
             )
-            for k, (like, check) in enumerate(zip(likely, checks, strict=True))
+            for k, (like, check) in enumerate(zip(likely, checks, strict=False))
         ]
 
     def _proposal(self, old: Subgraph, new: Subgraph, known: ConsistencyChecker) -> LoopHypothesis:
@@ -261,7 +269,7 @@ class LoopDetector:
         verifier, stages = self._verifier, self._config.stages
         if stages == "semantic":
             return verifier.hypothesis_from_landmarks(old, new)
-        proposal = verifier.hypothesis_from_features(old, new)
+        proposal = verifier.hypothesis_from_features(old, new, known.T_old_new)
         if proposal.rejected_reason and stages == "two_stage":
             proposal = _unless_refused(verifier.hypothesis_from_landmarks(old, new), proposal)
         if proposal.rejected_reason:

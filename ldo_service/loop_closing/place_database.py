@@ -88,8 +88,8 @@ Stages = Literal["two_stage", "semantic", "geometric"]
 class RetrievalConfig:
     """Parameters of the search for similar subgraphs."""
 
-    # Minimum number of camera frames between two subgraphs. Subgraphs with fewer frames between
-    # them are not loop candidates (LDO-SLAM paper, III.C).
+    # The two keyframes of a loop closure are more than this number of camera frames apart
+    # (LDO-SLAM paper, III.C). Subgraphs without such a pair of keyframes are not loop candidates.
     exclude_frames: int = 100
     candidates: int = 5  # K, the maximum number of candidates (LDO-SLAM paper, III.C).
     # theta_loop, the minimum cosine of the label histograms (LDO-SLAM paper, III.C).
@@ -99,6 +99,10 @@ class RetrievalConfig:
     # misses two of five objects. With a value above 1, similar labels are always required, as in
     # the LDO-SLAM paper.
     min_appearance: float = 0.35
+    # Besides the `candidates` most similar subgraphs, the nearest other one in the map is a
+    # candidate if the rotation plus parallax between a keyframe of each is at most this. At 0.7
+    # rad, 30 % of a view of 1 rad remain in view. A place may look different from two sides.
+    max_motion_rad: float = 0.7
     # Maximum number of stored subgraphs; if there are more, `PlaceDatabase` removes some.
     count: int = 1000
 
@@ -109,10 +113,12 @@ class RetrievalConfig:
                 + ": exclude_frames must not be negative, candidates must be at least 1 and count "
                 "at least 3."
             )
-        if not (0 <= self.min_similarity <= 1 and self.min_appearance >= 0):
+        if not (
+            0 <= self.min_similarity <= 1 and min(self.min_appearance, self.max_motion_rad) >= 0
+        ):
             raise ConfigError(
-                named(self, "min_similarity", "min_appearance")
-                + ": min_similarity must be within 0..1, min_appearance must not be negative."
+                named(self, "min_similarity", "min_appearance", "max_motion_rad")
+                + ": min_similarity must be within 0..1, the others must not be negative."
             )
 
 
@@ -125,8 +131,10 @@ class RetrievalMatch:
     layout: float  # Cosine of the histograms of pairs of labels and their distance.
     appearance: float  # Cosine of the visual-word histograms.
     # Score by which candidates are ranked: (appearance + (similarity + layout) / 2) / 2, if both
-    # subgraphs have detections and no setting excludes labels or images.
+    # subgraphs have detections and no setting excludes labels or images. It is 0 for a subgraph
+    # that is near but not similar.
     score: float
+    is_near: bool = False  # True if the poses in the map make it a candidate.
 
 
 class PlaceDatabase:
@@ -173,14 +181,19 @@ class PlaceDatabase:
         for table in (self._names, self._layout, self._words):
             table.remove(index)
 
-    def query(self, new: Subgraph, is_possible: np.ndarray) -> list[RetrievalMatch]:
+    def query(
+        self, new: Subgraph, is_possible: np.ndarray, motion_rad: np.ndarray | None = None
+    ) -> list[RetrievalMatch]:
         """Return the stored subgraphs that may show the same place, the likeliest first.
 
-        The setting `candidates` limits their number.
+        The setting `candidates` limits the number of similar subgraphs. One more may follow, which
+        is the nearest of the others in the map (see the setting `max_motion_rad`).
 
         Args:
             new: Subgraph to search for.
             is_possible: For each of the S stored subgraphs, whether to consider it, [S] bool.
+            motion_rad: Rotation plus parallax in the map between each stored subgraph and `new`,
+                [S]; infinite where unknown. None if no pose is known.
         """
         if not self.subgraphs:
             return []
@@ -188,8 +201,11 @@ class PlaceDatabase:
         layout = self._layout.cosines(new.layout)
         appearance = self._words.cosines(new.words)
         score = self._scores(new, similarity, layout, appearance)
-        score[~(self._are_far(new) & is_possible)] = 0
+        is_possible = self._are_far(new) & is_possible
+        score[~is_possible] = 0
         ranked = np.argsort(-score, kind="stable")[: self._config.candidates]
+        ranked = ranked[score[ranked] > 0]
+        near = self._nearest(is_possible, ranked, motion_rad)
         return [
             RetrievalMatch(
                 self.subgraphs[i],
@@ -197,10 +213,24 @@ class PlaceDatabase:
                 float(layout[i]),
                 float(appearance[i]),
                 float(score[i]),
+                is_near=i in near,
             )
-            for i in ranked.tolist()
-            if score[i] > 0
+            for i in [*ranked.tolist(), *near]
         ]
+
+    def _nearest(
+        self, is_possible: np.ndarray, ranked: np.ndarray, motion_rad: np.ndarray | None
+    ) -> list[int]:
+        """Return the nearest possible subgraph that is not among the ranked ones, if it is near.
+
+        The stage `semantic` uses no poses of the map.
+        """
+        if motion_rad is None or self._stages == "semantic":
+            return []
+        others_rad = np.where(is_possible, motion_rad, np.inf)
+        others_rad[ranked] = np.inf
+        nearest = int(others_rad.argmin())
+        return [nearest] if others_rad[nearest] <= self._config.max_motion_rad else []
 
     def _scores(
         self, new: Subgraph, similarity: np.ndarray, layout: np.ndarray, appearance: np.ndarray
@@ -231,12 +261,13 @@ class PlaceDatabase:
         return np.where(both_have_labels, both, np.where(has_similar_images, appearance, 0))
 
     def _are_far(self, new: Subgraph) -> np.ndarray:
-        """Return which subgraphs are over `exclude_frames` frames before the new one, [S] bool.
+        """Return which subgraphs have a keyframe `exclude_frames` frames from a new one, [S] bool.
 
-        Subgraphs with much larger frame numbers than the new one are included too. They are older,
-        because frame numbers restart at 0 when the camera restarts.
+        The distance must be larger than `exclude_frames`. Subgraphs with much larger frame numbers
+        than the new one are included too. They are older, because frame numbers restart at 0 when
+        the camera restarts.
         """
         first = np.array([subgraph.first_frame for subgraph in self.subgraphs])
         last = np.array([subgraph.last_frame for subgraph in self.subgraphs])
         exclude = self._config.exclude_frames
-        return (new.first_frame - last > exclude) | (first - new.last_frame > exclude)
+        return (new.last_frame - first > exclude) | (last - new.first_frame > exclude)

@@ -7,10 +7,9 @@ Direct alignment then refines the pose on the images. This may change it only a 
 refined pose, the surfaces must overlap without conflict. Conventions: `ldo_service.geometry`.
 """
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from itertools import islice, product
+from itertools import islice
 from typing import Literal
 
 import numpy as np
@@ -24,6 +23,7 @@ from ldo_service.tracking.keyframes import ReferenceKeyframe
 from ldo_service.tracking.motion import image_motion_rad
 from ldo_service.tracking.pyramid import PyramidConfig
 
+from .keyframe_pairs import KnownPose, likely_pairs, nearest_pairs, relative_pose
 from .object_points import (
     LandmarkAgreement,
     LandmarkConfig,
@@ -41,8 +41,6 @@ from .subgraph import Subgraph, SubgraphKeyframe
 
 NOTHING = LandmarkAgreement(0, 0, 0.0, 0.0)
 Evidence = Literal["", "landmarks", "features", "map"]
-# Function of an old and a new keyframe that returns T_old_new [4, 4], or None if it is unknown.
-KnownPose = Callable[[SubgraphKeyframe, SubgraphKeyframe], np.ndarray | None]
 # Maximum decompressed keyframes in the cache, 3 MB each: of a new subgraph and some candidates.
 OPENED = 12
 FIT_LEVEL = 1  # Pyramid level of 160 pixels width: 19,200 points suffice for the overlap.
@@ -59,12 +57,16 @@ class VerificationConfig:
     # Minimum number of matching landmarks that confirm a pose from features, if no second keyframe
     # gives the same pose.
     confirming_landmarks: int = 3
-    # Maximum rotation plus parallax between two poses from features that confirm each other.
+    # Maximum rotation plus parallax between a pose from features and another pose that confirms
+    # it, which comes from the features of another keyframe or from the map.
     confirmation_rad: float = 0.08
     pairs: int = 15  # Maximum pairs of keyframes for feature matching, 3 ms each.
     map_pairs: int = 3  # Maximum pairs of keyframes aligned at their poses in the map, 15 ms each.
-    # Minimum overlap of both surfaces if the pose does not come from features.
+    # Minimum overlap of both surfaces if the pose comes from landmarks.
     blind_overlap: float = 0.35
+    # Minimum overlap of both surfaces if the pose comes from the map. From this overlap on, the
+    # evaluation counts two keyframes as a loop.
+    map_overlap: float = 0.3
     # Maximum rotation plus parallax between two refined poses from the map that confirm each other;
     # 0.02 rad is a distance of 4 cm at a depth of 2 m.
     map_confirmation_rad: float = 0.02
@@ -140,41 +142,54 @@ class Verifier:
         align: AlignConfig,
         features: FeatureConfig,
         config: VerificationConfig,
+        min_gap_frames: int,
     ) -> None:
-        """Prepare a verifier with an empty cache."""
+        """Prepare a verifier with an empty cache.
+
+        Args:
+            pyramid: Settings of the image pyramids.
+            align: Settings of direct alignment.
+            features: Settings of feature matching.
+            config: Limits of the verification.
+            min_gap_frames: The keyframes of a closure are more than this number of frames apart.
+        """
         self._align, self._features, self._config = align, features, config
+        self._min_gap_frames = min_gap_frames
         self._opened = lru_cache(OPENED)(lambda view: view.place.keyframe(pyramid))
 
     # --- hypotheses -------------------------------------------------------------------------------
-    def hypothesis_from_features(self, old: Subgraph, new: Subgraph) -> LoopHypothesis:
+    def hypothesis_from_features(
+        self, old: Subgraph, new: Subgraph, T_old_new: KnownPose
+    ) -> LoopHypothesis:
         """Return the pose with the most feature inliers, marked as rejected if it is not confirmed.
 
         Pairs of keyframes are matched until a second keyframe of `new` gives the same pose as the
-        best pair so far. If none does, matching landmarks or the verification of another keyframe
-        of `new` must confirm the best pose; otherwise, the hypothesis is rejected.
+        best pair so far. If none does, matching landmarks, the pose in the map `T_old_new` or the
+        verification of another keyframe of `new` must confirm the best pose; otherwise, the
+        hypothesis is rejected.
         """
         found: list[LoopHypothesis] = []
-        for a, b in islice(_likely_pairs(old, new), self._config.pairs):
+        for a, b in islice(likely_pairs(old, new, self._min_gap_frames), self._config.pairs):
             pose = estimate_pose(a.place.features, b.place.features, b.place.camera, self._features)
             if pose is not None:
-                T_old_new = se3.inverse(pose.T_camera_reference)
-                found.append(LoopHypothesis(a, b, T_old_new, "features", pose.inliers))
+                T = se3.inverse(pose.T_camera_reference)
+                found.append(LoopHypothesis(a, b, T, "features", pose.inliers))
                 best = max(found, key=lambda proposal: proposal.inliers)
                 is_enough = best.inliers >= self._config.min_inliers
                 if is_enough and self._is_confirmed_by_any(
                     best, found, self._config.confirmation_rad
                 ):
                     return self._with_semantics(best, old, new)
-        return self._from_single_keyframe(found, old, new)
+        return self._from_single_keyframe(found, old, new, T_old_new)
 
     def _from_single_keyframe(
-        self, found: list[LoopHypothesis], old: Subgraph, new: Subgraph
+        self, found: list[LoopHypothesis], old: Subgraph, new: Subgraph, T_old_new: KnownPose
     ) -> LoopHypothesis:
         """Return the pose with the most inliers among `found`, rejected if it is not confirmed.
 
         A pose with fewer than `min_inliers` inliers is also rejected. The pose is confirmed by at
-        least `confirming_landmarks` matching landmarks, or by another keyframe of `new` whose
-        images pass the verification at this pose.
+        least `confirming_landmarks` matching landmarks, by an equal pose in the map, or by another
+        keyframe of `new` whose images pass the verification at this pose.
         """
         best = max(found, key=lambda proposal: proposal.inliers, default=None)
         if best is None:
@@ -186,13 +201,16 @@ class Verifier:
             return replace(best, rejected_reason=f"{best.inliers} features agree, too few")
         if best.semantics.count >= self._config.confirming_landmarks:
             return best
+        T = T_old_new(best.old, best.new)
+        if T is not None and self._are_equal(best, T, self._config.confirmation_rad):
+            return best
         if any(self._is_confirmed_by(best, view) for view in new.views if view is not best.new):
             return best
         return replace(best, rejected_reason="not confirmed by a second keyframe")
 
     def _is_confirmed_by(self, best: LoopHypothesis, view: SubgraphKeyframe) -> bool:
         """Return whether a pose passes the verification with another new keyframe, `view`."""
-        T_old_view = _between(best.old, view, _odometry_frames(best))
+        T_old_view = relative_pose(best.old, view, _odometry_frames(best))
         check = self.verify(replace(best, new=view, T_old_new=T_old_view))
         return check.closure is not None
 
@@ -204,11 +222,15 @@ class Verifier:
         It does if the two poses differ by less than `within_rad`, rotation plus parallax.
         """
         return any(
-            image_motion_rad(se3.inverse(best.T_old_new) @ _as_seen_by(best, other), _depth(best))
-            < within_rad
+            self._are_equal(best, _as_seen_by(best, other), within_rad)
             for other in found
             if other.new is not best.new
         )
+
+    def _are_equal(self, best: LoopHypothesis, T_old_new: np.ndarray, within_rad: float) -> bool:
+        """Return whether a hypothesis and a pose [4, 4] differ by less than `within_rad`."""
+        T = se3.inverse(best.T_old_new) @ T_old_new
+        return image_motion_rad(T, _depth(best)) < within_rad
 
     def hypothesis_from_landmarks(self, old: Subgraph, new: Subgraph) -> LoopHypothesis:
         """Return the relative pose of the two subgraphs that most landmarks agree with.
@@ -226,9 +248,15 @@ class Verifier:
             reason = f"{count} landmarks agree, too few"
             return LoopHypothesis(old.views[0], new.views[0], np.eye(4), rejected_reason=reason)
         semantics = compare_landmarks(old.landmarks, new.landmarks, pairs[motion.inliers])
-        nearest = _nearest_pairs(old, new, lambda a, b: _between(a, b, motion.T_a_b))
-        a, b, T_old_new = next(nearest)
-        return LoopHypothesis(a, b, T_old_new, "landmarks", count, semantics)
+
+        def T_old_new(a: SubgraphKeyframe, b: SubgraphKeyframe) -> np.ndarray:
+            return relative_pose(a, b, motion.T_a_b)
+
+        pair = next(nearest_pairs(old, new, T_old_new, self._min_gap_frames), None)
+        if pair is None:
+            reason = "the stored keyframes are too recent"
+            return LoopHypothesis(old.views[0], new.views[0], np.eye(4), rejected_reason=reason)
+        return LoopHypothesis(*pair, "landmarks", count, semantics)
 
     def hypothesis_from_map(
         self, old: Subgraph, new: Subgraph, T_old_new: KnownPose
@@ -246,7 +274,8 @@ class Verifier:
         finds none after a large drift.
         """
         found: list[LoopHypothesis] = []
-        for a, b, T in islice(_nearest_pairs(old, new, T_old_new), self._config.map_pairs):
+        pairs = nearest_pairs(old, new, T_old_new, self._min_gap_frames)
+        for a, b, T in islice(pairs, self._config.map_pairs):
             check = self._check_overlap(LoopHypothesis(a, b, T, "map"))
             if check is not None and check.closure is not None:
                 met = replace(check.proposal, T_old_new=check.closure.T_a_b)
@@ -259,7 +288,7 @@ class Verifier:
     def _check_overlap(self, proposal: LoopHypothesis) -> VerificationResult | None:
         """Verify a hypothesis; return None, without alignment, if surfaces overlap too little."""
         old, new = self._opened(proposal.old), self._opened(proposal.new)
-        T_old_new, least = proposal.T_old_new, self._config.blind_overlap
+        T_old_new, least = proposal.T_old_new, self._config.map_overlap
         if self._fit(old, new, T_old_new).overlap < least:
             return None
         if self._fit(new, old, se3.inverse(T_old_new)).overlap < least:
@@ -315,6 +344,11 @@ class Verifier:
             points, T_old_new, there.depth_m, there.camera, self._config.fit
         )
 
+    def _min_overlap(self, evidence: Evidence) -> float:
+        config = self._config
+        by_map = config.map_overlap if evidence == "map" else config.blind_overlap
+        return config.fit.min_overlap if evidence == "features" else by_map
+
     def _rejection_reason(
         self, proposal: LoopHypothesis, alignment: Alignment, fit: DepthConsistency, shared: float
     ) -> str:
@@ -336,8 +370,7 @@ class Verifier:
             return "degenerate alignment"
         if abs(np.log(max(alignment.gain, 1e-6))) > np.log(config.max_gain):
             return f"brightness ratio {alignment.gain:.2f} is out of range"
-        by_features = proposal.evidence == "features"
-        if shared < (config.fit.min_overlap if by_features else config.blind_overlap):
+        if shared < self._min_overlap(proposal.evidence):
             return f"overlap of only {shared:.2f}"
         if fit.rmse_m > config.fit.max_rmse_m:
             return f"surfaces are {100 * fit.rmse_m:.1f} cm apart"
@@ -349,41 +382,6 @@ class Verifier:
         return ""
 
 
-def _likely_pairs(
-    old: Subgraph, new: Subgraph
-) -> Iterator[tuple[SubgraphKeyframe, SubgraphKeyframe]]:
-    """Iterate over all pairs (old, new); pairs with the most visual words in common come first."""
-    pairs = list(product(old.views, new.views))
-    shared = [float(np.minimum(a.words, b.words).sum()) for a, b in pairs]
-    return (pairs[index] for index in np.argsort(-np.array(shared), kind="stable"))
-
-
-def _nearest_pairs(
-    old: Subgraph, new: Subgraph, T_old_new: KnownPose
-) -> Iterator[tuple[SubgraphKeyframe, SubgraphKeyframe, np.ndarray]]:
-    """Yield each new keyframe with its nearest old one, as (old, new, T_old_new [4, 4]).
-
-    The nearest pairs come first. Pairs without a known relative pose are skipped.
-    """
-    nearest = []
-    for b in new.views:
-        known = [(a, b, T) for a in old.views if (T := T_old_new(a, b)) is not None]
-        apart = [image_motion_rad(T, a.place.median_depth_m) for a, _, T in known]
-        if known:
-            index = int(np.argmin(apart))
-            nearest.append((apart[index], known[index]))
-    for index in np.argsort([apart for apart, _ in nearest], kind="stable"):
-        yield nearest[index][1]
-
-
-def _between(
-    old: SubgraphKeyframe, new: SubgraphKeyframe, T_oldodom_newodom: np.ndarray
-) -> np.ndarray:
-    """Return T_old_new [4, 4] of two keyframes from the transform between their odometry frames."""
-    T_odom_old, T_odom_new = old.place.T_odom_keyframe, new.place.T_odom_keyframe
-    return se3.orthonormalize(se3.inverse(T_odom_old) @ T_oldodom_newodom @ T_odom_new)
-
-
 def _odometry_frames(proposal: LoopHypothesis) -> np.ndarray:
     """Return T_oldodom_newodom [4, 4] of the odometry frames, as a hypothesis implies it."""
     T_odom_old = proposal.old.place.T_odom_keyframe
@@ -392,7 +390,7 @@ def _odometry_frames(proposal: LoopHypothesis) -> np.ndarray:
 
 def _as_seen_by(best: LoopHypothesis, other: LoopHypothesis) -> np.ndarray:
     """Return T_old_new [4, 4] of the two keyframes of `best`, as the hypothesis `other` implies."""
-    return _between(best.old, best.new, _odometry_frames(other))
+    return relative_pose(best.old, best.new, _odometry_frames(other))
 
 
 def _depth(proposal: LoopHypothesis) -> float:

@@ -1,6 +1,7 @@
 """Loop closures of a camera that returns to known places with drifted odometry."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -115,6 +116,41 @@ def test_recently_seen_place_is_no_candidate(first_walk, room) -> None:
     assert handle_all(LoopCloser(), with_empty_detections([*first_walk, *soon])) == []
 
 
+def test_partly_recent_subgraphs_are_closed_by_keyframes_of_100_frames_apart(
+    first_walk, room
+) -> None:
+    """The walks are 68 frames apart, their ends 122 frames."""
+    soon = keyframes_of(room, SECOND_WALK, len(FIRST_WALK), 95, DRIFT)
+    found = closures(handle_all(LoopCloser(), with_empty_detections([*first_walk, *soon])))
+    frames = {k.keyframe: k.frame for k in [*first_walk, *soon]}
+    assert found
+    for closure in found:
+        assert frames[closure.pose.keyframe] - frames[closure.pose.reference] > 100
+
+
+@pytest.mark.parametrize(("max_motion_rad", "shift_m"), [(0.0, 0.04), (0.7, 0.04), (0.7, 3.0)])
+def test_nearest_subgraph_is_a_candidate_without_a_similar_one(
+    first_walk, room, max_motion_rad: float, shift_m: float
+) -> None:
+    retrieval = RetrievalConfig(min_appearance=2.0, max_motion_rad=max_motion_rad)
+    actor = LoopCloser(LoopCloserConfig(loops=LoopsConfig(retrieval=retrieval)))
+    messages = with_empty_detections([*first_walk, *drifted_by(room, shift_m)])
+    found = handle_all(actor, messages)
+    if max_motion_rad and shift_m < 1:
+        assert len(closures(found)) >= 2
+    else:
+        assert found == []
+
+
+def test_nearest_subgraph_is_not_verified_after_a_closure(first_walk, room) -> None:
+    """One candidate is similar, and another subgraph of the place is the nearest one."""
+    loops = LoopsConfig(retrieval=RetrievalConfig(candidates=1))
+    actor = LoopCloser(LoopCloserConfig(loops=loops))
+    messages = with_empty_detections([*first_walk, *drifted_by(room, 0.04)])
+    found = handle_all(actor, messages)
+    assert len(closures(found)) == len(candidates(found)) >= 2
+
+
 def test_similar_place_beyond_possible_drift_is_rejected(first_walk, room) -> None:
     """The same images, 1.5 m away or turned by 60 degrees, which is more than odometry drifts."""
     for xi in (np.array([0, 0, 0, 1.5, 0, 0.0]), np.array([0, np.pi / 3, 0, 0, 0, 0])):
@@ -165,7 +201,7 @@ def test_hypothesis_with_a_wrong_pose_is_rejected(first_walk, second_walk) -> No
     handle_all(actor, with_empty_detections([*first_walk, *second_walk]))
     first, *_, last = actor.recognizer.subgraphs
     old, new = first.views[-1], last.views[0]
-    verifier = Verifier(config.pyramid, config.align, config.features, config.verification)
+    verifier = Verifier(config.pyramid, config.align, config.features, config.verification, 100)
     T = se3.inverse(old.place.T_odom_keyframe) @ se3.inverse(DRIFT) @ new.place.T_odom_keyframe
     assert verifier.verify(LoopHypothesis(old, new, T, "features", 99)).closure is not None
     for axis, step in ((0, 0.5), (2, 0.7), (3, 0.8), (4, 0.6), (5, -0.9)):
@@ -176,13 +212,35 @@ def test_hypothesis_with_a_wrong_pose_is_rejected(first_walk, second_walk) -> No
         assert planted.rejected_reason
 
 
+def test_pose_of_a_single_keyframe_is_confirmed_by_an_equal_pose_in_the_map(
+    first_walk, second_walk
+) -> None:
+    actor, config = LoopCloser(), LoopsConfig()
+    handle_all(actor, with_empty_detections([*first_walk, *second_walk]))
+    old, *_, new = actor.recognizer.subgraphs
+    new = replace(new, views=new.views[:1])
+    verifier = Verifier(config.pyramid, config.align, config.features, config.verification, 100)
+
+    def pose_in_map(error_m: float) -> Callable[..., np.ndarray]:
+        T_error = se3.exp(np.array([0, 0, 0, error_m, 0, 0])) @ se3.inverse(DRIFT)
+        return lambda a, b: se3.inverse(a.place.T_odom_keyframe) @ T_error @ b.place.T_odom_keyframe
+
+    near, far, unknown = (
+        verifier.hypothesis_from_features(old, new, known)
+        for known in (pose_in_map(0.02), pose_in_map(0.5), lambda *_: None)
+    )
+    assert near.inliers >= config.verification.min_inliers
+    assert near.rejected_reason == ""
+    assert far.rejected_reason == unknown.rejected_reason == "not confirmed by a second keyframe"
+
+
 def test_low_overlap_is_accepted_with_features_and_rejected_with_landmarks(room) -> None:
     """Frames 9 and 72 have an overlap of a third, which suffices for features."""
     actor, config = LoopCloser(), LoopsConfig()
     keyframes = keyframes_of(room, range(9, 14), 0, 0), keyframes_of(room, range(72, 77), 5, 500)
     handle_all(actor, with_empty_detections([*keyframes[0], *keyframes[1]]))
     old, new = (subgraph.views[0] for subgraph in actor.recognizer.subgraphs)
-    verifier = Verifier(config.pyramid, config.align, config.features, config.verification)
+    verifier = Verifier(config.pyramid, config.align, config.features, config.verification, 100)
     T = se3.inverse(true_pose(room, 9)) @ true_pose(room, 72)
     assert verifier.verify(LoopHypothesis(old, new, T, "features", 99)).closure is not None
     assert verifier.verify(LoopHypothesis(old, new, T, "landmarks", 99)).rejected_reason.startswith(
@@ -341,7 +399,8 @@ def test_equal_detected_labels_give_high_similarity(first_walk, second_walk) -> 
 
 
 def test_different_labels_without_appearance_give_no_candidate(first_walk, second_walk) -> None:
-    literal = RetrievalConfig(min_appearance=1.1)  # Labels alone decide, as in the paper.
+    # Labels alone decide, as in the paper.
+    literal = RetrievalConfig(min_appearance=1.1, max_motion_rad=0)
     actor = LoopCloser(LoopCloserConfig(loops=LoopsConfig(retrieval=literal)))
     messages = [
         *with_detections(first_walk, "chair", "sink"),

@@ -66,6 +66,7 @@ def coarse_ms(repeats: int = 20) -> float:
         place = SimpleNamespace(submap=0, median_depth_m=2.0)
         poses.add(number, None, np.eye(4), se3.exp(rng.normal(size=6)))
         return SimpleNamespace(
+            submap=0,
             views=[SimpleNamespace(keyframe=number, place=place, path_m=float(number))],
             first_frame=20 * number,
             last_frame=20 * number + 15,
@@ -83,7 +84,8 @@ def coarse_ms(repeats: int = 20) -> float:
         is_possible = plausible.possible_matches(
             [old.views[0] for old in memory.subgraphs], new.views[0]
         )
-        assert memory.query(new, is_possible)
+        motion_rad = plausible.image_motions(memory.subgraphs, new, is_possible)
+        assert memory.query(new, is_possible, motion_rad)
         times_ms.append(1e3 * (time.process_time() - start_s))
     return float(np.median(times_ms))
 

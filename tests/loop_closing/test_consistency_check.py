@@ -48,3 +48,29 @@ def test_keyframes_without_a_known_relative_pose_are_possible_matches() -> None:
     assert merged.possible_matches([view(0, 0.0, submap=1)], new).tolist() == [False]
     assert separate.possible_matches([view(7, 0.0), view(0, 0.0)], new).tolist() == [True, False]
     assert separate.possible_matches([], new).tolist() == []
+
+
+def subgraph(*views: Any) -> Any:
+    return SimpleNamespace(views=views, submap=views[0].place.submap)
+
+
+def test_image_motion_is_the_smallest_between_keyframes_of_both_subgraphs() -> None:
+    """A distance of 1 m is a parallax of 0.5 rad at a depth of 2 m."""
+    poses = keyframe_poses((0,) * 6, (0, 0, 0, 3, 0, 0), (0, 0, 0, 4, 0, 0), (0, 0.3, 0, 5, 0, 0))
+    old = [subgraph(view(0, 0.0), view(1, 3.0)), subgraph(view(0, 0.0))]
+    new = subgraph(view(2, 4.0), view(3, 5.0))
+    checker = ConsistencyChecker(poses, {}, CONFIG)
+    motions_rad = checker.image_motions(old, new, np.array([True, True]))
+    np.testing.assert_allclose(motions_rad, [0.5, 2.0])
+    assert checker.image_motions([], new, np.zeros(0, bool)).tolist() == []
+
+
+def test_image_motion_is_infinite_without_a_known_relative_pose() -> None:
+    poses = keyframe_poses((0,) * 6, (0,) * 6)
+    old = [subgraph(view(0, 0.0)), subgraph(view(0, 0.0, submap=1)), subgraph(view(9, 0.0))]
+    separate, merged = (ConsistencyChecker(poses, j, CONFIG) for j in ({}, {1: 0}))
+    new, possible = subgraph(view(1, 1.0)), np.array([False, True, True])
+    assert separate.image_motions(old, new, possible).tolist() == [np.inf] * 3
+    assert merged.image_motions(old, new, possible).tolist() == [np.inf, 0, np.inf]
+    unknown = subgraph(view(8, 1.0))
+    assert merged.image_motions(old, unknown, possible).tolist() == [np.inf] * 3

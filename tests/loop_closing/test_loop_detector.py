@@ -18,13 +18,15 @@ DEPTH_ERROR = "the surfaces differ"
 
 def subgraph(keyframe: int) -> Any:
     place = SimpleNamespace(submap=0, median_depth_m=2.0, T_odom_keyframe=np.eye(4))
-    return SimpleNamespace(
-        views=(SimpleNamespace(keyframe=keyframe, place=place, path_m=50.0 * (keyframe == NEW)),)
-    )
+    view = SimpleNamespace(keyframe=keyframe, place=place, path_m=50.0 * (keyframe == NEW))
+    return SimpleNamespace(submap=0, views=(view,))
 
 
 def results(
-    monkeypatch: pytest.MonkeyPatch, inliers: tuple[int, int], reasons: tuple[str, str]
+    monkeypatch: pytest.MonkeyPatch,
+    inliers: tuple[int, int],
+    reasons: tuple[str, str],
+    is_second_near: bool = False,
 ) -> list[LoopCandidateResult]:
     """Return the results of two candidates, 4 m apart.
 
@@ -32,9 +34,13 @@ def results(
         monkeypatch: Fixture, which replaces retrieval and verification.
         inliers: Inliers of both candidates.
         reasons: Reasons for which the verification rejects them; "" if it accepts them.
+        is_second_near: True if the map makes the second one a candidate, not its similarity.
     """
     detector, new = LoopDetector(LoopsConfig()), subgraph(NEW)
-    matches = [RetrievalMatch(subgraph(k), 1.0, 1.0, 1.0, 1.0) for k in (0, 1)]
+    matches = [
+        RetrievalMatch(subgraph(k), 1.0, 1.0, 1.0, 1.0, is_near=is_near)
+        for k, is_near in enumerate((False, is_second_near))
+    ]
     poses = KeyframePoses()
     for k, x_m in enumerate((0.0, 4.0, 2.0)):
         poses.add(k, None, np.eye(4), se3.exp(np.array([0, 0, 0, x_m, 0, 0])))
@@ -53,7 +59,7 @@ def results(
             closure=None if reasons[old] else closure,
         )
 
-    monkeypatch.setattr(detector._memory, "query", lambda _new, _may: matches)
+    monkeypatch.setattr(detector._memory, "query", lambda *_: matches)
     monkeypatch.setattr(detector, "_proposal", proposed)
     monkeypatch.setattr(detector, "_check", checked)
     return detector._findings(new, poses, {}, None)
@@ -81,3 +87,12 @@ def test_clearly_better_candidate_closes_the_loop(monkeypatch) -> None:
     found = results(monkeypatch, (20, 60), ("", ""))
     assert reasons_of(found) == ["ambiguous: another place fits as well", ""]
     assert found[1].closure is not None
+
+
+@pytest.mark.parametrize(("reason", "expected"), [(DEPTH_ERROR, [DEPTH_ERROR, ""]), ("", [""])])
+def test_nearest_subgraph_is_verified_only_if_no_similar_one_passes(
+    monkeypatch, reason: str, expected: list[str]
+) -> None:
+    found = results(monkeypatch, (60, 50), (reason, ""), is_second_near=True)
+    assert reasons_of(found) == expected
+    assert found[-1].closure is not None
