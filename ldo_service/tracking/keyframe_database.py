@@ -101,7 +101,7 @@ class KeyframeRecord:
         The features are detected on the first call and cached.
         """
         if "_across_scales" not in self.__dict__:
-            image = self._gray, self.depth_m, self.camera
+            image = self.gray_image, self.depth_m, self.camera
             seen = detect_sift(*image, config.count_across_scales // 2, config)
             self.__dict__["_across_scales"] = seen
         return self.__dict__["_across_scales"]
@@ -151,7 +151,7 @@ class KeyframeRecord:
 
         Every call returns bitwise the same images.
         """
-        view = build_pyramid(self._gray, self.depth_m, self.camera, config)
+        view = build_pyramid(self.gray_image, self.depth_m, self.camera, config)
         return ReferenceKeyframe(
             view, self.T_odom_keyframe, self.id, self.submap, stored_features=self.features
         )
@@ -170,7 +170,7 @@ class KeyframeRecord:
             self,
             points_camera=points[kept].astype(np.float32),
             descriptors=self.descriptors[kept],
-            gray=_gray_bytes(self._gray, ignore_mask),
+            gray=_gray_bytes(self.gray_image, ignore_mask),
             depth=_depth_bytes(self.depth_m, ignore_mask),
             change=None,
         )
@@ -180,7 +180,8 @@ class KeyframeRecord:
         return replace(self, change=change.after(self.change))
 
     @property
-    def _gray(self) -> np.ndarray:
+    def gray_image(self) -> np.ndarray:
+        """Gray image [H, W] uint8; 0 where pixels are ignored."""
         png = np.frombuffer(self.gray, np.uint8)
         gray = np.asarray(cv2.imdecode(png, cv2.IMREAD_GRAYSCALE), np.uint8)
         return gray if self.change is None else self.change.gray(gray, self.camera)

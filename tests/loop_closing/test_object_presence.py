@@ -53,9 +53,12 @@ class View:
     place: Any
 
 
-def subgraph(first: int, *depths_m: np.ndarray) -> Any:
+GRAY = np.full((CAMERA.height, CAMERA.width), 128, np.uint8)
+
+
+def subgraph(first: int, *depths_m: np.ndarray, gray: np.ndarray = GRAY) -> Any:
     views = [
-        View(first + k, SimpleNamespace(depth_m=depth, camera=CAMERA))
+        View(first + k, SimpleNamespace(depth_m=depth, gray_image=gray, camera=CAMERA))
         for k, depth in enumerate(depths_m)
     ]
     return SimpleNamespace(views=views)
@@ -108,6 +111,27 @@ def test_flat_object_on_the_wall_is_hit() -> None:
     )
     hit, through = ray_fractions(picture, depth_of(), CAMERA)
     assert (hit[0], through[0]) == (1, 0)
+
+
+@pytest.mark.parametrize(
+    ("contrast", "is_in_both", "missing"), [(60, False, 1), (60, True, 0), (4, False, 0)]
+)
+def test_flat_object_is_missing_if_the_images_do_not_correlate(
+    contrast: int, is_in_both: bool, missing: int
+) -> None:
+    """A clock on the wall has two dark quarters. Depth shows the wall at both places."""
+    clock = MapLandmarks(
+        np.array([[0.0, 0, WALL_M]]), np.diag([0.04, 0.04, 0])[None], np.ones((1, 1))
+    )
+    noise = np.random.default_rng(0).integers(126, 131, GRAY.shape)
+    v, u = np.indices(GRAY.shape)
+    shown = noise + contrast * ((u > 79) ^ (v > 59))
+    other = shown if is_in_both else np.random.default_rng(1).integers(126, 131, GRAY.shape)
+    old = subgraph(0, depth_of(), gray=shown.astype(np.uint8))
+    new = subgraph(1, depth_of(), gray=other.astype(np.uint8))
+    poses = poses_of(np.eye(4), np.eye(4))
+    found = ObjectPresenceChecker().check(clock, old, new, np.eye(4), poses)
+    assert (found.tested, found.missing) == (2, missing)
 
 
 @pytest.mark.parametrize(
