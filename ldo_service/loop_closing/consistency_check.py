@@ -98,31 +98,38 @@ class ConsistencyChecker:
         return may
 
     def image_motions(
-        self, old: Sequence[Subgraph], new: Subgraph, is_possible: np.ndarray
+        self,
+        old: Sequence[Subgraph],
+        new: Subgraph,
+        is_possible: np.ndarray,
+        min_gap_frames: int,
     ) -> np.ndarray:
         """Return how far each of S stored subgraphs is from a new one in the map, [S] rad.
 
         This is the smallest rotation plus parallax between a stored keyframe of the one and a
-        keyframe of the other. It is infinite for subgraphs that are not possible, and for those
-        without a known relative pose.
+        keyframe of the other that can be closed: both are more than `min_gap_frames` apart.
+        Otherwise, the subgraph before the new one would always be the nearest. The result is
+        infinite for subgraphs that are not possible, and for those without a known relative pose.
 
         Args:
             old: Stored subgraphs.
             new: New subgraph.
             is_possible: Which subgraphs to compare, [S] bool.
+            min_gap_frames: The keyframes of a closure are more than this number of frames apart.
         """
         motions_rad = np.full(len(old), np.inf)
-        T_new = self._poses.of([view.keyframe for view in new.views])
         at = [k for k in np.flatnonzero(is_possible).tolist() for _ in old[k].views]
         views = [view for k in np.flatnonzero(is_possible).tolist() for view in old[k].views]
         known = np.flatnonzero(self._are_known(views, new.submap))
-        if len(known) and len(T_new):
-            views = [views[k] for k in known.tolist()]
-            T_old = self._poses.of([view.keyframe for view in views])
+        views = [views[k] for k in known.tolist()]
+        new_views = [view for view in new.views if view.keyframe in self._poses]
+        if views and new_views:
+            T_old, T_new = (self._poses.of([v.keyframe for v in of]) for of in (views, new_views))
             depth_m = np.array([view.place.median_depth_m for view in views])
-            T_old_new = se3.inverse(T_old)[:, None] @ T_new
-            nearest_rad = image_motions_rad(T_old_new, depth_m[:, None]).min(axis=1)
-            np.minimum.at(motions_rad, np.array(at)[known], nearest_rad)
+            apart_rad = image_motions_rad(se3.inverse(T_old)[:, None] @ T_new, depth_m[:, None])
+            frames, new_frames = (np.array([v.frame for v in of]) for of in (views, new_views))
+            apart_rad[np.abs(new_frames - frames[:, None]) <= min_gap_frames] = np.inf
+            np.minimum.at(motions_rad, np.array(at)[known], apart_rad.min(axis=1))
         return motions_rad
 
     def _are_known(self, views: Sequence[SubgraphKeyframe], submap: int) -> np.ndarray:

@@ -230,7 +230,9 @@ class LoopDetector:
         is_possible = known.possible_matches(
             [old.views[0] for old in self.subgraphs], new.views[-1]
         )
-        motion_rad = known.image_motions(self.subgraphs, new, is_possible)
+        motion_rad = known.image_motions(
+            self.subgraphs, new, is_possible, self._config.retrieval.exclude_frames
+        )
         likely = self._memory.query(new, is_possible, motion_rad)
         checks: list[VerificationResult] = []
         for like in likely:
@@ -269,7 +271,7 @@ class LoopDetector:
         verifier, stages = self._verifier, self._config.stages
         if stages == "semantic":
             return verifier.hypothesis_from_landmarks(old, new)
-        proposal = verifier.hypothesis_from_features(old, new, known.T_old_new)
+        proposal = verifier.hypothesis_from_features(old, new)
         if proposal.rejected_reason and stages == "two_stage":
             proposal = _unless_refused(verifier.hypothesis_from_landmarks(old, new), proposal)
         if proposal.rejected_reason:

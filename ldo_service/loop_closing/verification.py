@@ -57,8 +57,7 @@ class VerificationConfig:
     # Minimum number of matching landmarks that confirm a pose from features, if no second keyframe
     # gives the same pose.
     confirming_landmarks: int = 3
-    # Maximum rotation plus parallax between a pose from features and another pose that confirms
-    # it, which comes from the features of another keyframe or from the map.
+    # Maximum rotation plus parallax between two poses from features that confirm each other.
     confirmation_rad: float = 0.08
     pairs: int = 15  # Maximum pairs of keyframes for feature matching, 3 ms each.
     map_pairs: int = 3  # Maximum pairs of keyframes aligned at their poses in the map, 15 ms each.
@@ -89,8 +88,8 @@ class VerificationConfig:
                 named(self, "min_inliers", "pairs")
                 + ": min_inliers must be at least 6, pairs at least 1."
             )
-        if not 0 <= self.blind_overlap <= 1:
-            raise ConfigError(named(self, "blind_overlap") + " must be within 0..1.")
+        if not (0 <= self.blind_overlap <= 1 and 0 <= self.map_overlap <= 1):
+            raise ConfigError(named(self, "blind_overlap", "map_overlap") + " must be within 0..1.")
         angles = (self.confirmation_rad, self.refined_rad, self.refined_landmarks_rad)
         if min(*angles, self.map_confirmation_rad) <= 0 or self.map_pairs < 0:
             raise ConfigError(
@@ -158,38 +157,35 @@ class Verifier:
         self._opened = lru_cache(OPENED)(lambda view: view.place.keyframe(pyramid))
 
     # --- hypotheses -------------------------------------------------------------------------------
-    def hypothesis_from_features(
-        self, old: Subgraph, new: Subgraph, T_old_new: KnownPose
-    ) -> LoopHypothesis:
+    def hypothesis_from_features(self, old: Subgraph, new: Subgraph) -> LoopHypothesis:
         """Return the pose with the most feature inliers, marked as rejected if it is not confirmed.
 
         Pairs of keyframes are matched until a second keyframe of `new` gives the same pose as the
-        best pair so far. If none does, matching landmarks, the pose in the map `T_old_new` or the
-        verification of another keyframe of `new` must confirm the best pose; otherwise, the
-        hypothesis is rejected.
+        best pair so far. If none does, matching landmarks or the verification of another keyframe
+        of `new` must confirm the best pose; otherwise, the hypothesis is rejected.
         """
         found: list[LoopHypothesis] = []
         for a, b in islice(likely_pairs(old, new, self._min_gap_frames), self._config.pairs):
             pose = estimate_pose(a.place.features, b.place.features, b.place.camera, self._features)
             if pose is not None:
-                T = se3.inverse(pose.T_camera_reference)
-                found.append(LoopHypothesis(a, b, T, "features", pose.inliers))
+                T_old_new = se3.inverse(pose.T_camera_reference)
+                found.append(LoopHypothesis(a, b, T_old_new, "features", pose.inliers))
                 best = max(found, key=lambda proposal: proposal.inliers)
                 is_enough = best.inliers >= self._config.min_inliers
                 if is_enough and self._is_confirmed_by_any(
                     best, found, self._config.confirmation_rad
                 ):
                     return self._with_semantics(best, old, new)
-        return self._from_single_keyframe(found, old, new, T_old_new)
+        return self._from_single_keyframe(found, old, new)
 
     def _from_single_keyframe(
-        self, found: list[LoopHypothesis], old: Subgraph, new: Subgraph, T_old_new: KnownPose
+        self, found: list[LoopHypothesis], old: Subgraph, new: Subgraph
     ) -> LoopHypothesis:
         """Return the pose with the most inliers among `found`, rejected if it is not confirmed.
 
         A pose with fewer than `min_inliers` inliers is also rejected. The pose is confirmed by at
-        least `confirming_landmarks` matching landmarks, by an equal pose in the map, or by another
-        keyframe of `new` whose images pass the verification at this pose.
+        least `confirming_landmarks` matching landmarks, or by another keyframe of `new` whose
+        images pass the verification at this pose.
         """
         best = max(found, key=lambda proposal: proposal.inliers, default=None)
         if best is None:
@@ -200,9 +196,6 @@ class Verifier:
         if best.inliers < self._config.min_inliers:
             return replace(best, rejected_reason=f"{best.inliers} features agree, too few")
         if best.semantics.count >= self._config.confirming_landmarks:
-            return best
-        T = T_old_new(best.old, best.new)
-        if T is not None and self._are_equal(best, T, self._config.confirmation_rad):
             return best
         if any(self._is_confirmed_by(best, view) for view in new.views if view is not best.new):
             return best
@@ -222,15 +215,11 @@ class Verifier:
         It does if the two poses differ by less than `within_rad`, rotation plus parallax.
         """
         return any(
-            self._are_equal(best, _as_seen_by(best, other), within_rad)
+            image_motion_rad(se3.inverse(best.T_old_new) @ _as_seen_by(best, other), _depth(best))
+            < within_rad
             for other in found
             if other.new is not best.new
         )
-
-    def _are_equal(self, best: LoopHypothesis, T_old_new: np.ndarray, within_rad: float) -> bool:
-        """Return whether a hypothesis and a pose [4, 4] differ by less than `within_rad`."""
-        T = se3.inverse(best.T_old_new) @ T_old_new
-        return image_motion_rad(T, _depth(best)) < within_rad
 
     def hypothesis_from_landmarks(self, old: Subgraph, new: Subgraph) -> LoopHypothesis:
         """Return the relative pose of the two subgraphs that most landmarks agree with.

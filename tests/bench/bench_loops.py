@@ -60,14 +60,20 @@ def coarse_ms(repeats: int = 20) -> float:
     """Return the median CPU time of one query among 1000 subgraphs."""
     rng = np.random.default_rng(0)
     config, poses = LoopsConfig(), KeyframePoses()
-    memory = PlaceDatabase(config.words.count, "two_stage", RetrievalConfig(count=SUBGRAPHS))
+    retrieval = RetrievalConfig(count=SUBGRAPHS)
+    memory = PlaceDatabase(config.words.count, "two_stage", retrieval)
+    per_subgraph = config.subgraphs.max_keyframes
 
-    def subgraph(number: int) -> Any:
+    def view(number: int, k: int) -> Any:
+        keyframe, frame = per_subgraph * number + k, 20 * number + 3 * k
         place = SimpleNamespace(submap=0, median_depth_m=2.0)
-        poses.add(number, None, np.eye(4), se3.exp(rng.normal(size=6)))
+        poses.add(keyframe, None, np.eye(4), se3.exp(rng.normal(size=6)))
+        return SimpleNamespace(keyframe=keyframe, place=place, path_m=float(number), frame=frame)
+
+    def subgraph(number: int, views: int = config.subgraphs.kept_views) -> Any:
         return SimpleNamespace(
             submap=0,
-            views=[SimpleNamespace(keyframe=number, place=place, path_m=float(number))],
+            views=[view(number, k) for k in range(views)],
             first_frame=20 * number,
             last_frame=20 * number + 15,
             names=rng.poisson(0.02, MAX_LABELS).astype(np.float32),
@@ -77,14 +83,16 @@ def coarse_ms(repeats: int = 20) -> float:
 
     for number in range(SUBGRAPHS):
         memory.add(subgraph(number))
-    new, times_ms = subgraph(SUBGRAPHS + 100), []
+    new, times_ms = subgraph(SUBGRAPHS + 100, per_subgraph), []
     for _ in range(repeats):
         start_s = time.process_time()
         plausible = ConsistencyChecker(poses, {}, ConsistencyCheckConfig())
         is_possible = plausible.possible_matches(
             [old.views[0] for old in memory.subgraphs], new.views[0]
         )
-        motion_rad = plausible.image_motions(memory.subgraphs, new, is_possible)
+        motion_rad = plausible.image_motions(
+            memory.subgraphs, new, is_possible, retrieval.exclude_frames
+        )
         assert memory.query(new, is_possible, motion_rad)
         times_ms.append(1e3 * (time.process_time() - start_s))
     return float(np.median(times_ms))

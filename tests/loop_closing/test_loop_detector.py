@@ -6,11 +6,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses, RelativePose
 from ldo_service.loop_closing import LoopCandidateResult, LoopDetector, LoopsConfig
 from ldo_service.loop_closing.place_database import RetrievalMatch
-from ldo_service.loop_closing.verification import LoopHypothesis, VerificationResult
+from ldo_service.loop_closing.verification import (
+    LoopHypothesis,
+    VerificationConfig,
+    VerificationResult,
+)
 
 NEW = 2  # Id of the keyframe of the new subgraph; the old subgraphs have the keyframes 0 and 1.
 DEPTH_ERROR = "the surfaces differ"
@@ -18,7 +23,9 @@ DEPTH_ERROR = "the surfaces differ"
 
 def subgraph(keyframe: int) -> Any:
     place = SimpleNamespace(submap=0, median_depth_m=2.0, T_odom_keyframe=np.eye(4))
-    view = SimpleNamespace(keyframe=keyframe, place=place, path_m=50.0 * (keyframe == NEW))
+    view = SimpleNamespace(
+        keyframe=keyframe, frame=500 * keyframe, place=place, path_m=50.0 * (keyframe == NEW)
+    )
     return SimpleNamespace(submap=0, views=(view,))
 
 
@@ -96,3 +103,10 @@ def test_nearest_subgraph_is_verified_only_if_no_similar_one_passes(
     found = results(monkeypatch, (60, 50), (reason, ""), is_second_near=True)
     assert reasons_of(found) == expected
     assert found[-1].closure is not None
+
+
+@pytest.mark.parametrize("name", ["blind_overlap", "map_overlap"])
+@pytest.mark.parametrize("value", [-0.1, 1.1, np.nan])
+def test_overlap_outside_of_0_to_1_is_refused(name: str, value: float) -> None:
+    with pytest.raises(ConfigError, match=name):
+        VerificationConfig(**{name: value})
