@@ -19,8 +19,10 @@ NEAREST_M = 0.05  # Minimum depth of the points of a ray; the renderer has the s
 # and three standard deviations of the depth.
 MARGIN_M = 0.02
 DEPTH_SIGMAS = 3.0
-GRID = 20  # Rows and columns of the compared pixels.
-MIN_PIXELS = 60  # Minimum pixels; the correlation of unrelated images is then 0 +- 0.13.
+GRID = 20  # Maximum rows and columns of the compared pixels.
+# Minimum number of different pixels in either image. If the errors of 60 pixels are independent,
+# the correlation of unrelated images is 0 +- 0.13. Neighboring pixels are not independent.
+MIN_PIXELS = 60
 MIN_SIZE_PX = 6.0  # Minimum width and height of the object in the first image.
 SMOOTH_PX = 3  # Width of the smoothed block of pixels: poses have an error of about a pixel.
 
@@ -86,7 +88,8 @@ def compare_images(
         second: Keyframe to compare.
 
     Returns:
-        The comparison; None if the images have fewer than `MIN_PIXELS` pixels in common.
+        The comparison; None if either image has fewer than `MIN_PIXELS` pixels in common with the
+        other one. An object that is far away in one of them has too few.
     """
     u, v, p = _surface(p_map, covariance, first)
     if len(u) < MIN_PIXELS:
@@ -102,7 +105,8 @@ def compare_images(
     at = ahead[same]
     a, b = first.gray[v[at], u[at]], second.gray[v_there[same], u_there[same]]
     both = np.isfinite(a) & np.isfinite(b)
-    if np.count_nonzero(both) < MIN_PIXELS:
+    pixels_there = (v_there * second.camera.width + u_there)[same][both]
+    if len(np.unique(pixels_there)) < MIN_PIXELS:
         return None
     a, b = a[both] - a[both].mean(), b[both] - b[both].mean()
     correlation = float((a * b).mean() / max(a.std() * b.std(), 1e-6))
@@ -132,7 +136,7 @@ def _surface(
     high = np.minimum(center + half, [camera.width - 1, camera.height - 1])
     if np.any(high - low < MIN_SIZE_PX):
         return nothing
-    sides = [np.rint(np.linspace(low[k], high[k], GRID)).astype(np.int64) for k in (0, 1)]
+    sides = [np.unique(np.rint(np.linspace(low[k], high[k], GRID))).astype(int) for k in (0, 1)]
     u, v = (side.ravel() for side in np.meshgrid(*sides))
     z = image.depth_m[v, u]
     u, v, z = u[z > 0], v[z > 0], z[z > 0]

@@ -19,14 +19,14 @@ CENTER_M = np.array([0.0, 0.0, WALL_M])
 POSTER = np.diag([0.03, 0.03, 0.0])  # Covariance of a flat poster, 0.6 m wide.
 
 
-def wall(x_m: float = 0.0, turn_rad: float = 0.0) -> PosedImage:
-    """Return the image of a wall with a pattern of waves, from a camera at x."""
+def wall(x_m: float = 0.0, turn_rad: float = 0.0, z_m: float = 0.0) -> PosedImage:
+    """Return the image of a wall with a pattern of waves, from a camera at x and z."""
     T_map_camera = np.eye(4)
     c, s = np.cos(turn_rad), np.sin(turn_rad)
     T_map_camera[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
-    T_map_camera[0, 3] = x_m
+    T_map_camera[:3, 3] = x_m, 0, z_m
     rays = CAMERA.rays() @ T_map_camera[:3, :3].T
-    depth_m = WALL_M / rays[..., 2]
+    depth_m = (WALL_M - z_m) / rays[..., 2]
     x, y = rays[..., 0] * depth_m + x_m, rays[..., 1] * depth_m
     gray = smoothed((128 + 50 * np.sin(14 * x + 3) * np.cos(11 * y)).astype(np.uint8))
     return PosedImage(gray, depth_m.astype(np.float32), CAMERA, T_map_camera)
@@ -73,6 +73,17 @@ def test_hidden_small_and_outside_objects_are_not_compared() -> None:
     assert compare_images(CENTER_M, 1e-6 * POSTER, here, here) is None
     assert compare_images(CENTER_M + np.array([5.0, 0.0, 0.0]), POSTER, here, here) is None
     assert compare_images(-CENTER_M, POSTER, here, here) is None
+
+
+def test_object_with_few_different_pixels_in_one_image_is_not_compared() -> None:
+    """A poster of 0.2 m is 15 pixels wide from 2 m, and 3 pixels wide from 10 m."""
+    small = np.diag([0.0033, 0.0033, 0.0])
+    near, far = wall(), wall(z_m=-8.0)
+    assert compare_images(CENTER_M, small, near, near) is not None
+    assert compare_images(CENTER_M, small, near, far) is None
+    assert compare_images(CENTER_M, small, far, near) is None
+    tiny = small / 6  # 8 pixels wide, of which fewer than 50 are on the object.
+    assert compare_images(CENTER_M, tiny, near, near) is None
 
 
 def test_ignored_pixels_are_left_out() -> None:
