@@ -108,5 +108,6 @@ def test_nearest_subgraph_is_verified_only_if_no_similar_one_passes(
 @pytest.mark.parametrize("name", ["blind_overlap", "map_overlap"])
 @pytest.mark.parametrize("value", [-0.1, 1.1, np.nan])
 def test_overlap_outside_of_0_to_1_is_refused(name: str, value: float) -> None:
+    settings: dict[str, Any] = {name: value}
     with pytest.raises(ConfigError, match=name):
-        VerificationConfig(**{name: value})
+        VerificationConfig(**settings)
