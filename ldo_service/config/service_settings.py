@@ -9,7 +9,7 @@ from msgspec import Meta
 
 from ldo_service.datasets import SequenceOptions
 from ldo_service.errors import ConfigError
-from ldo_service.gaussians.device_choice import Device
+from ldo_service.kernels.gpu.device import Device
 from ldo_service.transport.endpoint import LOOPBACK, MAX_MESSAGE_MB
 
 from .values import (

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from ldo_service.errors import ConfigError, named
+from ldo_service.kernels.gpu.device import DeviceChoice
 
-from .device_choice import DeviceChoice
 from .keyframe_store import KeyframeViews
 from .model import GaussianMap
 from .optimizer import GaussianOptimizer, GaussianOptimizerConfig

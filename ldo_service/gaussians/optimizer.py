@@ -10,9 +10,10 @@ import numpy as np
 
 from ldo_service.errors import ConfigError, DeviceError, named
 from ldo_service.geometry import se3
+from ldo_service.kernels.gpu.device import Device
 
 from .adam import AdamConfig
-from .device_choice import Device, choose_backend, given
+from .device_choice import choose_backend, given
 from .exposure import Exposure
 from .loss import ImageLoss, LossWeights
 from .model import GaussianMap

@@ -16,8 +16,7 @@ from ldo_service.actors.mapper import Mapper
 from ldo_service.actors.topology import actor_spec
 from ldo_service.config import Config, actor_parameters, config_of
 from ldo_service.errors import ConfigError, DataError
-from ldo_service.gaussians.device_choice import Device
-from ldo_service.kernels.gpu.device import gpu_facts
+from ldo_service.kernels.gpu.device import Device, gpu_facts
 from ldo_service.recordings.recording import JournalFile, recorded_actors
 from ldo_service.recordings.replay import ReplayReport, replay
 from ldo_service.runtime import Actor

@@ -101,7 +101,7 @@ def fail(*_: object) -> None:
 
 
 def test_devices_without_a_gpu_are_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ldo_service.gaussians.device_choice.find_gpu", missing_gpu)
+    monkeypatch.setattr("ldo_service.kernels.gpu.device.find_gpu", missing_gpu)
     mapper, networks = doctor.devices()
     assert (mapper.mark, networks.mark) == ("note", "note")
     assert mapper.text.startswith("service.device=auto chooses cpu (")
@@ -111,7 +111,7 @@ def test_devices_without_a_gpu_are_the_cpu(monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.mark.skipif(not TRITON, reason="`make gpu-check` installs Triton")
 def test_gpu_that_fails_the_self_test_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ldo_service.gaussians.device_choice.find_gpu", gpu)
+    monkeypatch.setattr("ldo_service.kernels.gpu.device.find_gpu", gpu)
     monkeypatch.setattr("ldo_service.gaussians.gpu_self_test.run_self_test", fail)
     mapper, _ = doctor.devices()
     assert mapper.mark == "warn"
@@ -120,7 +120,7 @@ def test_gpu_that_fails_the_self_test_is_a_warning(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.skipif(not TRITON, reason="`make gpu-check` installs Triton")
 def test_gpu_that_passes_the_self_test_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ldo_service.gaussians.device_choice.find_gpu", gpu)
+    monkeypatch.setattr("ldo_service.kernels.gpu.device.find_gpu", gpu)
     monkeypatch.setattr("ldo_service.gaussians.gpu_self_test.run_self_test", lambda _: None)
     mapper, _ = doctor.devices()
     assert mapper.mark == "ok"

@@ -187,7 +187,7 @@ def no_gpu() -> Gpu:
 def test_missing_gpu_is_replaced_by_the_cpu(
     wanted: str, warnings: int, monkeypatch: pytest.MonkeyPatch, caplog
 ) -> None:
-    monkeypatch.setattr("ldo_service.gaussians.device_choice.find_gpu", no_gpu)
+    monkeypatch.setattr("ldo_service.kernels.gpu.device.find_gpu", no_gpu)
     backend, choice = choose_backend(wanted, CONFIG.adam, CONFIG.loss, CONFIG.limits)
     assert type(backend) is CpuBackend
     assert choice.has_failed == bool(warnings) == bool(caplog.records)
@@ -206,7 +206,7 @@ def test_unexpected_error_of_the_self_test_selects_the_cpu(
         raise TypeError("launch() takes 3 arguments")
 
     gpu = Gpu("Some GPU", {}, HostArrays())
-    monkeypatch.setattr("ldo_service.gaussians.device_choice.find_gpu", lambda: gpu)
+    monkeypatch.setattr("ldo_service.kernels.gpu.device.find_gpu", lambda: gpu)
     monkeypatch.setattr(gpu_self_test, "run_self_test", self_test)
     backend, choice = choose_backend("auto", CONFIG.adam, CONFIG.loss, CONFIG.limits)
     assert type(backend) is CpuBackend
@@ -227,7 +227,7 @@ def test_gpu_is_chosen_if_it_passes_the_self_test(
             raise error
 
     gpu = Gpu("Some GPU", {"triton": "3"}, HostArrays())
-    monkeypatch.setattr("ldo_service.gaussians.device_choice.find_gpu", lambda: gpu)
+    monkeypatch.setattr("ldo_service.kernels.gpu.device.find_gpu", lambda: gpu)
     monkeypatch.setattr(gpu_self_test, "run_self_test", self_test)
     backend, choice = choose_backend(wanted, CONFIG.adam, CONFIG.loss, CONFIG.limits)
     assert choice.has_failed == bool(error)

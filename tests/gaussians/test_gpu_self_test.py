@@ -99,7 +99,7 @@ def test_keyframe_of_a_lost_device_is_mapped_by_the_cpu(
 ) -> None:
     arrays = FailingArrays()
     gpu = Gpu("interpreter", {"triton": "3.7.1"}, arrays)
-    monkeypatch.setattr("ldo_service.gaussians.device_choice.find_gpu", lambda: gpu)
+    monkeypatch.setattr("ldo_service.kernels.gpu.device.find_gpu", lambda: gpu)
     monkeypatch.setattr("ldo_service.gaussians.gpu_self_test.run_self_test", lambda _: None)
     builder, on_cpu = MapBuilder(config_for("auto")), MapBuilder(config_for("cpu"))
     add(builder, room, 0)

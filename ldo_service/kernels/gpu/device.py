@@ -1,16 +1,22 @@
-"""Search for a GPU that the kernels can use."""
+"""Search for a GPU that the kernels can use, and choice between it and the CPU."""
 
+import logging
 import platform
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from importlib import import_module
-from typing import Any
+from typing import Any, Literal, TypeVar
 
 from ldo_service.errors import DeviceError, install_command
+from ldo_service.kernels import isa
 
 from .arrays import Arrays, TorchArrays
 
+log = logging.getLogger(__name__)
+
+Device = Literal["auto", "cpu", "cuda", "openvino"]
+Made = TypeVar("Made")
 # Lowest compute capability for which `make gpu-check` compiles the kernels, times 10.
 MIN_CAPABILITY = 75
 
@@ -28,6 +34,80 @@ class Gpu:
     name: str
     versions: dict[str, str]
     arrays: Arrays
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceChoice:
+    """Device that computes the results of an actor.
+
+    Attributes:
+        device: cpu or cuda.
+        reason: Sentence that says why.
+        name: Instruction set of the CPU, or model of the GPU.
+        versions: Versions that determine the bits of the results; empty on the CPU.
+        has_failed: A GPU was found or asked for, and the CPU replaces it.
+    """
+
+    device: str
+    reason: str
+    name: str
+    versions: dict[str, str] = field(default_factory=dict)
+    has_failed: bool = False
+
+    def failed(self, error: DeviceError) -> "DeviceChoice":
+        """Return the choice after a failure of the GPU."""
+        return replace(on_cpu(f"the GPU {self.name} failed: {error}"), has_failed=True)
+
+    def metrics(self) -> dict[str, float]:
+        """Return `device_failed` (1 if the CPU replaces a GPU) and `on_gpu` (1 on a GPU)."""
+        return {"device_failed": float(self.has_failed), "on_gpu": float(self.device == "cuda")}
+
+
+def on_cpu(reason: str) -> DeviceChoice:
+    """Return the choice of the CPU."""
+    return DeviceChoice("cpu", reason, isa())
+
+
+def choose_device(
+    wanted: str, actor: str, work: str, make: Callable[[Arrays], Made]
+) -> tuple[Made | None, DeviceChoice]:
+    """Choose a device: a GPU if it passes a self-test, otherwise the CPU.
+
+    Args:
+        wanted: Setting `service.device`. A GPU is used with auto and cuda. If it is missing, that
+            is a failure with cuda alone.
+        actor: Actor that uses the device, for the log.
+        work: What the device does, such as "the map is fitted", for the log.
+        make: Function that runs the self-test on a GPU and returns what computes on it.
+
+    Returns:
+        The result of `make`, or None for the CPU; and the choice.
+    """
+    if wanted not in ("auto", "cuda"):
+        return None, on_cpu(f"service.device={wanted} was chosen.")
+    try:
+        gpu = find_gpu()
+    except DeviceError as error:
+        choice = replace(on_cpu(str(error)), has_failed=wanted == "cuda")
+        if choice.has_failed:
+            log.warning("%s: no GPU can be used, so %s on the CPU: %s", actor, work, error)
+        return None, choice
+    try:
+        with device_errors("self-test"):
+            made = make(gpu.arrays)
+    except DeviceError as error:
+        choice = DeviceChoice("cuda", "", gpu.name).failed(error)
+        log.warning(
+            "%s: %s %s on the CPU.",
+            actor,
+            choice.reason,
+            work[0].upper() + work[1:],
+            exc_info=error.__cause__,
+        )
+        return None, choice
+    reason = "the GPU passed the self-test."
+    log.info("%s: %s on %s (experimental): %s", actor, work, gpu.name, reason)
+    return made, DeviceChoice("cuda", reason, gpu.name, gpu.versions)
 
 
 def find_gpu() -> Gpu:
