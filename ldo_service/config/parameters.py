@@ -50,12 +50,13 @@ from ldo_service.semantics.semantic_map import SemanticMapConfig
 from ldo_service.tracking.alignment import AlignConfig, ResidualConfig
 from ldo_service.tracking.features import FeatureConfig
 from ldo_service.tracking.keyframe_database import KeyframeDatabaseConfig
+from ldo_service.tracking.keyframe_reuse import KeyframeReuseConfig
 from ldo_service.tracking.keyframes import KeyframeConfig
 from ldo_service.tracking.motion_segmentation import MotionSegmentationConfig
 from ldo_service.tracking.odometry_config import OdometryConfig
 from ldo_service.tracking.odometry_prior import PriorConfig
 from ldo_service.tracking.pyramid import DepthNoise, PyramidConfig
-from ldo_service.tracking.relocalization import KeyframeReuseConfig, RelocalizationConfig
+from ldo_service.tracking.relocalization import RelocalizationConfig
 from ldo_service.tracking.shutter import ShutterConfig
 from ldo_service.tracking.submaps import SubmapConfig
 from ldo_service.tracking.tracking_quality import TrackingQualityConfig

@@ -37,11 +37,11 @@ from .alignment import BrightnessModel
 from .background import with_foreground
 from .frame_tracking import FrameTracker
 from .keyframe_database import KeyframeRecord, make_keyframe_record
+from .keyframe_reuse import KeyframeReuse, ReusedKeyframe, find_nearby_keyframes
 from .keyframes import ReferenceKeyframe, keyframe_dynamic_class_mask, limit_ratios
 from .map_frame import MapCorrection, MapFrame
 from .odometry_config import OdometryConfig
 from .odometry_prior import OdometryPriorBuffer, PriorPose
-from .relocalization import KeyframeReuse, ReusedKeyframe, find_nearby_keyframes
 from .state import KeyframeOrigin, pack, unpack
 from .tracking_quality import TrackingStatus
 from .tracking_result import (

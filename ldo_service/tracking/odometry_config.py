@@ -8,12 +8,13 @@ from ldo_service.errors import ConfigError
 from .alignment import AlignConfig
 from .features import FeatureConfig, GicpConfig
 from .keyframe_database import KeyframeDatabaseConfig
+from .keyframe_reuse import KeyframeReuseConfig
 from .keyframes import KeyframeConfig
 from .motion_segmentation import MotionSegmentationConfig
 from .odometry_prior import PriorConfig
 from .pose_candidates import PoseHypothesisConfig
 from .pyramid import PyramidConfig
-from .relocalization import KeyframeReuseConfig, RelocalizationConfig
+from .relocalization import RelocalizationConfig
 from .shutter import ShutterConfig
 from .submaps import SubmapConfig
 from .tracking_quality import TrackingQualityConfig

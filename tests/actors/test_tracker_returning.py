@@ -15,7 +15,7 @@ from ldo_service.schemas import FrameRgbd, Keyframe, TrackedPose
 from ldo_service.schemas.topics import KEYFRAME_NEW
 from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.tracking import OdometryConfig
-from ldo_service.tracking.relocalization import KeyframeReuseConfig
+from ldo_service.tracking.keyframe_reuse import KeyframeReuseConfig
 
 
 def config_with_reuse(after: int) -> TrackerConfig:

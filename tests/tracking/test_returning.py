@@ -20,13 +20,13 @@ from ldo_service.tracking import (
     pyramid_of,
 )
 from ldo_service.tracking.keyframe_database import KeyframeRecord
-from ldo_service.tracking.keyframes import KeyframeConfig
-from ldo_service.tracking.map_frame import MapCorrection
-from ldo_service.tracking.relocalization import (
+from ldo_service.tracking.keyframe_reuse import (
     KeyframeReuse,
     KeyframeReuseConfig,
     find_nearby_keyframes,
 )
+from ldo_service.tracking.keyframes import KeyframeConfig
+from ldo_service.tracking.map_frame import MapCorrection
 from ldo_service.tracking.state import KeyframeOrigin
 from ldo_service.tracking.tracking_quality import ResidualHistory, TrackingQualityConfig
 from ldo_service.tracking.tracking_result import KeyframeKind
