@@ -330,6 +330,7 @@ class Tracker(Actor):
             "frames_without_prior": self._without_prior,  # Since the first pose of the prior.
             "prior_rejected": refused,
             "prior_restarts": restarts,
+            **self._odometry.aligner.device.metrics(),
             **self._calibration.metrics(),
             **self._calibration.evidence(),
             **self._shutter.metrics(),

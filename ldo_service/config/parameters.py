@@ -147,6 +147,7 @@ def _tracker(config: Config) -> TrackerConfig:
     return TrackerConfig(
         T_base_camera=CameraExtrinsics(mounting.translation_m, mounting.quaternion_wxyz),
         odometry=OdometryConfig(
+            device=config.service.device,
             pyramid=_pyramid(config),
             align=_align(config),
             features=FeatureConfig(count=tracker.features.max_features),

@@ -16,6 +16,7 @@ and the pose increment xi, which changes the pose to T_reference_camera * exp(xi
 `ldo_service.geometry`.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -154,6 +155,10 @@ def normal_equations(
     )
 
 
+# Computation of normal equations, with the arguments of `normal_equations`.
+Linearizer = Callable[..., NormalEquations]
+
+
 @dataclass(frozen=True, slots=True)
 class AlignConfig:
     """Settings of direct alignment."""
@@ -248,6 +253,7 @@ def align(
     frame: Pyramid,
     T_camera_reference: np.ndarray,
     config: AlignConfig,
+    linearize: Linearizer = normal_equations,
 ) -> Alignment:
     """Align a frame to reference points by Gauss-Newton, from an initial guess.
 
@@ -260,6 +266,7 @@ def align(
         frame: Pyramid of the frame.
         T_camera_reference: Initial guess, [4, 4].
         config: Settings.
+        linearize: Computation of the normal equations.
 
     Returns:
         The pose, with its quality on the finest pyramid level.
@@ -270,7 +277,7 @@ def align(
     for level in reversed(range(levels)):
         points, target = reference.points[level], frame.levels[level]
         for _ in range(config.iterations[min(level, len(config.iterations) - 1)]):
-            equations = normal_equations(points, target, T, appearance, config.residuals)
+            equations = linearize(points, target, T, appearance, config.residuals)
             step = _step(equations, reference.median_depth_m, config)
             T = se3.exp(-step[POSE]) @ T
             appearance = _improved(appearance, step, equations, config)
@@ -278,7 +285,7 @@ def align(
             converged = _image_motion_px(step, target, reference) < config.stop_px
             if converged:
                 break
-    return _evaluate(reference, frame, T, appearance, config, count, converged)
+    return _evaluate(reference, frame, T, appearance, config, count, converged, linearize)
 
 
 def _evaluate(
@@ -289,6 +296,7 @@ def _evaluate(
     config: AlignConfig,
     iterations: int,
     converged: bool,
+    linearize: Linearizer,
 ) -> Alignment:
     """Evaluate the residuals of a given pose on the finest pyramid level, without optimization.
 
@@ -300,13 +308,14 @@ def _evaluate(
         config: Settings.
         iterations: Value of `Alignment.iterations` in the result.
         converged: Value of `Alignment.converged` in the result.
+        linearize: Computation of the normal equations.
     """
     T = se3.orthonormalize(T_camera_reference)
     points = reference.points[0]
     cells = reference.cells
-    e = normal_equations(points, frame.levels[0], T, appearance, config.residuals, cells)
+    e = linearize(points, frame.levels[0], T, appearance, config.residuals, cells)
     covariance = pose_covariance(e.hessian, e.cells.reshape(-1, 8), config.covariance)
-    difference = _contradiction(reference, frame, T, appearance, config.residuals)
+    difference = _contradiction(reference, frame, T, appearance, config.residuals, linearize)
     covariance += np.outer(difference, difference)
     total = max(points.shape[1], 1)
     return Alignment(
@@ -333,12 +342,13 @@ def _contradiction(
     T_camera_reference: np.ndarray,
     appearance: BrightnessModel,
     config: ResidualConfig,
+    linearize: Linearizer,
 ) -> np.ndarray:
     """Return by how much color and depth contradict each other at a pose, [6]."""
     level = min(CUE_LEVEL, len(frame.levels) - 1, len(reference.points) - 1)
     points, target = reference.points[level], frame.levels[level]
     color, depth = (
-        normal_equations(points, target, T_camera_reference, noise, config)
+        linearize(points, target, T_camera_reference, noise, config)
         for noise in (
             replace(appearance, depth_noise_scale=NO_WEIGHT),
             replace(appearance, intensity_sigma=NO_WEIGHT),

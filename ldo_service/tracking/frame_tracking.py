@@ -15,6 +15,7 @@ from ldo_service.calibration.knowledge import CameraKnowledge
 from ldo_service.calibration.shutter import FrameMotion
 from ldo_service.geometry import RgbdFrame, se3
 
+from .aligner import choose_aligner
 from .alignment import Alignment
 from .frame_compensation import FrameCompensator
 from .keyframe_database import KeyframeDatabase, make_thumbnail
@@ -45,15 +46,14 @@ class FrameTracker:
     def __init__(self, config: OdometryConfig) -> None:
         self.config = config
         self.state = OdometryState(shutter=ShutterState(config.shutter.initial))
+        self.aligner = choose_aligner(config.device)
         self._relocalizer = Relocalizer(
-            config.pyramid,
-            config.align,
-            config.features,
-            config.tracking_quality,
-            config.relocalization,
+            *(config.pyramid, config.align, config.features, config.tracking_quality),
+            *(config.relocalization, self.aligner),
         )
         self._guesses = InitialGuessAligner(
-            config.align, config.features, config.shape, config.candidates, config.large_motion
+            *(config.align, config.features, config.shape),
+            *(config.candidates, config.large_motion, self.aligner),
         )
         self._compensator = FrameCompensator(config, self._guesses)
         self._prior: PriorPose | None = None  # Prior of the last frame.

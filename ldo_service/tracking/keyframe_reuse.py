@@ -19,6 +19,7 @@ from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 
+from .aligner import CPU_ALIGNER, Aligner
 from .alignment import AlignConfig
 from .keyframe_database import KeyframeRecord
 from .keyframes import KeyframeConfig, ReferenceKeyframe, left_keyframe_view, limit_ratios
@@ -86,6 +87,7 @@ class KeyframeReuse:
     keyframes: KeyframeConfig
     tracking_quality: TrackingQualityConfig
     config: KeyframeReuseConfig
+    aligner: Aligner = CPU_ALIGNER
 
     def find(
         self, view: Pyramid, near: Sequence[Nearby], history: ResidualHistory
@@ -102,7 +104,9 @@ class KeyframeReuse:
         """
         for record, T_record_camera in near[: self.config.tries]:
             keyframe = record.keyframe(self.pyramid)
-            candidate = align_hypothesis(keyframe, view, T_record_camera, "reused", self.align)
+            candidate = align_hypothesis(
+                keyframe, view, T_record_camera, "reused", self.align, self.aligner
+            )
             histories = history, record.history(history)
             if self._is_sure(candidate, T_record_camera, histories):
                 return ReusedKeyframe(record, keyframe, candidate)

@@ -58,6 +58,9 @@ class Odometry:
     """Odometry of one camera, with its pose in the map.
 
     Equal frames, priors and corrections give bitwise equal results.
+
+    Attributes:
+        aligner: Direct alignment, with the device on which it runs.
     """
 
     def __init__(
@@ -73,13 +76,11 @@ class Odometry:
         self.config = config or OdometryConfig()
         self._T_base_camera = np.eye(4) if T_base_camera is None else T_base_camera
         self._frames = FrameTracker(self.config)
+        self.aligner = self._frames.aligner
         self._map = MapFrame()
         self._reuse = KeyframeReuse(
-            self.config.pyramid,
-            self.config.align,
-            self.config.keyframes,
-            self.config.tracking_quality,
-            self.config.keyframe_reuse,
+            *(self.config.pyramid, self.config.align, self.config.keyframes),
+            *(self.config.tracking_quality, self.config.keyframe_reuse, self.aligner),
         )
         self._earlier = RecentKeyframeCache(self.config.pyramid)
 
@@ -378,7 +379,8 @@ class Odometry:
         usual = BrightnessModel(
             intensity_sigma=tracked.intensity_sigma, depth_noise_scale=tracked.depth_noise_scale
         )
-        return measure_against(earlier, keyframe, usual, self.config.align, self.config.window)
+        config = self.config
+        return measure_against(earlier, keyframe, usual, config.align, config.window, self.aligner)
 
     def _keyframe_of(self, frame: RgbdFrame, tracked: TrackedFrame) -> ReferenceKeyframe:
         view = self._frames.view(frame)
@@ -394,7 +396,5 @@ class Odometry:
         )
 
     def _record_of(self, keyframe: ReferenceKeyframe) -> KeyframeRecord:
-        history = self._frames.state.history
-        return make_keyframe_record(
-            keyframe, self.config.features, self.config.keyframe_database, history
-        )
+        history, config = self._frames.state.history, self.config
+        return make_keyframe_record(keyframe, config.features, config.keyframe_database, history)

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 from ldo_service.detection.dynamic_classes import DynamicClassConfig
 from ldo_service.errors import ConfigError
+from ldo_service.kernels.gpu.device import Device
 
 from .alignment import AlignConfig
 from .features import FeatureConfig, GicpConfig
@@ -25,6 +26,8 @@ from .window import WindowConfig
 class OdometryConfig:
     """Settings of odometry and all its steps."""
 
+    # Device of the alignment; cuda: a GPU if it passes a self-test, otherwise the CPU.
+    device: Device = "cpu"
     pyramid: PyramidConfig = field(default_factory=PyramidConfig)
     align: AlignConfig = field(default_factory=AlignConfig)
     features: FeatureConfig = field(default_factory=FeatureConfig)

@@ -12,7 +12,8 @@ import numpy as np
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 
-from .alignment import AlignConfig, Alignment, align, normal_equations
+from .aligner import CPU_ALIGNER, Aligner
+from .alignment import AlignConfig, Alignment
 from .features import FeatureConfig, GicpConfig, detect, estimate_pose, register_gicp
 from .keyframes import ReferenceKeyframe
 from .motion import image_motion_rad
@@ -71,6 +72,7 @@ def align_hypothesis(
     T_keyframe_camera: np.ndarray,
     pose_source: str,
     config: AlignConfig,
+    aligner: Aligner = CPU_ALIGNER,
 ) -> PoseHypothesis:
     """Align a frame directly to a keyframe from an initial guess, and return the hypothesis.
 
@@ -80,11 +82,12 @@ def align_hypothesis(
         T_keyframe_camera: Initial guess, [4, 4].
         pose_source: Name of the initial guess.
         config: Settings.
+        aligner: Device of the alignment.
     """
     guess = se3.inverse(T_keyframe_camera)
     reference = keyframe.reference
     return PoseHypothesis(
-        align(reference, view, guess, config), pose_source, reference.median_depth_m
+        aligner.align(reference, view, guess, config), pose_source, reference.median_depth_m
     )
 
 
@@ -94,6 +97,7 @@ def support(
     keyframe: ReferenceKeyframe,
     view: Pyramid,
     config: AlignConfig,
+    aligner: Aligner = CPU_ALIGNER,
 ) -> float:
     """Return the support of a hypothesis: a weighted fraction of inliers, 0..1.05.
 
@@ -109,6 +113,7 @@ def support(
         keyframe: The keyframe.
         view: Pyramid of the frame.
         config: Settings.
+        aligner: Device of the evaluation.
     """
     own = candidate.alignment
     common = replace(
@@ -118,7 +123,7 @@ def support(
     )
     points = keyframe.reference.points[0]
     T_camera_keyframe = se3.orthonormalize(se3.inverse(own.T_reference_camera))
-    seen = normal_equations(points, view.levels[0], T_camera_keyframe, common, config.residuals)
+    seen = aligner.linearize(points, view.levels[0], T_camera_keyframe, common, config.residuals)
     total = max(points.shape[1], 1)
     return seen.photometric.inlier_fraction * (
         PHOTOMETRIC_ONLY_WEIGHT * (seen.visible / total)
@@ -133,6 +138,7 @@ def select_hypothesis(
     view: Pyramid,
     config: PoseHypothesisConfig,
     align_config: AlignConfig,
+    aligner: Aligner = CPU_ALIGNER,
 ) -> PoseHypothesis:
     """Select the hypothesis with the most support, and set its `is_confirmed`.
 
@@ -145,8 +151,9 @@ def select_hypothesis(
         view: Pyramid of the frame.
         config: Settings.
         align_config: Settings of alignment.
+        aligner: Device of the alignment.
     """
-    supports = [support(c, candidates, keyframe, view, align_config) for c in candidates]
+    supports = [support(c, candidates, keyframe, view, align_config, aligner) for c in candidates]
     winner, least = int(np.argmax(supports)), config.min_support_ratio * max(supports)
     apart = [
         hypothesis_distance_rad(candidates[winner], c.alignment.T_reference_camera)
@@ -180,6 +187,7 @@ class InitialGuessAligner:
     candidates: PoseHypothesisConfig
     # Image motion above which all initial guesses are tried, image widths per frame.
     large_motion: float
+    aligner: Aligner = CPU_ALIGNER
 
     def align_from_guess(
         self,
@@ -189,7 +197,9 @@ class InitialGuessAligner:
         pose_source: str = "direct",
     ) -> PoseHypothesis:
         """Align from the initial guess T_keyframe_camera [4, 4], and return the hypothesis."""
-        return align_hypothesis(keyframe, view, T_keyframe_camera, pose_source, self.align)
+        return align_hypothesis(
+            keyframe, view, T_keyframe_camera, pose_source, self.align, self.aligner
+        )
 
     def align_from_all_guesses(
         self,
@@ -215,8 +225,10 @@ class InitialGuessAligner:
             candidates.append(self.align_from_guess(keyframe, view, T_keyframe_reckoned, "prior"))
         second, pose_source = self._independent_estimate(keyframe, view, T_keyframe_previous)
         if second is not None:
-            candidates.append(align_hypothesis(keyframe, view, second, pose_source, self.align))
-        chosen = select_hypothesis(candidates, second, keyframe, view, self.candidates, self.align)
+            candidates.append(self.align_from_guess(keyframe, view, second, pose_source))
+        chosen = select_hypothesis(
+            candidates, second, keyframe, view, self.candidates, self.align, self.aligner
+        )
         # A hypothesis that started at the feature pose may still be there if alignment has not
         # converged. Its distance to the feature pose is then no evidence.
         is_independent = chosen.pose_source != "features" or chosen.alignment.converged
@@ -240,7 +252,7 @@ class InitialGuessAligner:
         finest = replace(keyframe.reference, points=keyframe.reference.points[:REALIGNED_LEVELS])
         guess = se3.inverse(candidate.alignment.T_reference_camera)
         start = replace(self.align, start=candidate.alignment.appearance)
-        return replace(candidate, alignment=align(finest, view, guess, start))
+        return replace(candidate, alignment=self.aligner.align(finest, view, guess, start))
 
     def is_large_step(
         self, candidate: PoseHypothesis, T_keyframe_previous: np.ndarray, view: Pyramid

@@ -23,6 +23,7 @@ import numpy as np
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 
+from .aligner import CPU_ALIGNER, Aligner
 from .alignment import AlignConfig
 from .features import (
     FeatureConfig,
@@ -122,6 +123,7 @@ class Relocalizer:
     features: FeatureConfig
     tracking_quality: TrackingQualityConfig
     config: RelocalizationConfig
+    aligner: Aligner = CPU_ALIGNER
 
     def find(
         self,
@@ -216,7 +218,9 @@ class Relocalizer:
         for record, pose in poses[: self.config.attempts]:
             keyframe = record.keyframe(self.pyramid)
             guess = se3.inverse(pose.T_camera_reference)
-            candidate = align_hypothesis(keyframe, view, guess, "relocalized", self.align)
+            candidate = align_hypothesis(
+                keyframe, view, guess, "relocalized", self.align, self.aligner
+            )
             if self._is_sure(candidate, guess, record.history(history)):
                 return (record, pose), (keyframe, replace(candidate, is_confirmed=True))
         return None

@@ -14,7 +14,8 @@ from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 
-from .alignment import AlignConfig, Alignment, BrightnessModel, align
+from .aligner import CPU_ALIGNER, Aligner
+from .alignment import AlignConfig, Alignment, BrightnessModel
 from .keyframe_database import KeyframeRecord
 from .keyframes import ReferenceKeyframe
 from .pyramid import PyramidConfig
@@ -87,6 +88,7 @@ def measure_against(
     usual: BrightnessModel,
     align_config: AlignConfig,
     config: WindowConfig,
+    aligner: Aligner = CPU_ALIGNER,
 ) -> list[RelativePose]:
     """Measure the pose of a new keyframe relative to earlier ones that show the same surface.
 
@@ -97,6 +99,7 @@ def measure_against(
             values, and `config.max_noise` is a multiple of this noise.
         align_config: Settings of alignment.
         config: Settings.
+        aligner: Device of the alignment.
 
     Returns:
         At most `config.measurements` relative poses.
@@ -106,7 +109,7 @@ def measure_against(
     for other in earlier:
         if len(poses) == config.measurements:
             break
-        alignment = _aligned(other, keyframe, measure, config.levels)
+        alignment = _aligned(other, keyframe, measure, config.levels, aligner)
         if _is_sure(alignment, usual, config):
             T_other_keyframe, information = alignment.T_reference_camera, alignment.information
             poses.append(RelativePose(other.id, keyframe.id, T_other_keyframe, information))
@@ -114,11 +117,15 @@ def measure_against(
 
 
 def _aligned(
-    other: ReferenceKeyframe, keyframe: ReferenceKeyframe, config: AlignConfig, levels: int
+    other: ReferenceKeyframe,
+    keyframe: ReferenceKeyframe,
+    config: AlignConfig,
+    levels: int,
+    aligner: Aligner,
 ) -> Alignment:
     reference = replace(other.reference, points=other.reference.points[:levels])
     guess = se3.inverse(keyframe.T_odom_keyframe) @ other.T_odom_keyframe
-    return align(reference, keyframe.view, guess, config)
+    return aligner.align(reference, keyframe.view, guess, config)
 
 
 def _is_sure(alignment: Alignment, usual: BrightnessModel, config: WindowConfig) -> bool:

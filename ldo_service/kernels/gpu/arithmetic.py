@@ -14,7 +14,10 @@ import triton.language as tl
 # Integer arguments of kernels. Triton would compile another variant of a kernel for sizes of 1
 # and for multiples of 16, even in the middle of a run, because the number of pairs always
 # changes.
-SIZES = ("n", "n_pairs", "n_visible", "width", "height", "columns", "side", "across", "down")
+SIZES = (
+    *("n", "n_pairs", "n_visible", "n_programs"),
+    *("width", "height", "columns", "side", "across", "down"),
+)
 kernel: Any = partial(triton.jit, do_not_specialize=SIZES)  # Decorator of launched functions.
 
 PINNED = {"enable_fp_fusion": False}  # Option of each launch and each compilation.

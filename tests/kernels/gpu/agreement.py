@@ -18,6 +18,11 @@ LIMITS = {
     "derivatives of loss to C++": 5e-6,
     "derivatives of loss to reference": 5e-6,
     "block means to OpenCV": 5e-7,
+    # The unit is the square root of the diagonal of the Hessian.
+    "normal equations to C++": 1e-6,
+    "normal equations to reference": 1e-5,
+    "gradients by cell to C++": 1e-6,
+    "gradients by cell to reference": 5e-6,
     # Ten iterations of the optimizer on 64x64 pixels; the rows are compared by columns.
     "rows after ten iterations": 1e-2,
     "median of rows after ten iterations": 1e-5,

@@ -34,9 +34,11 @@ from triton.compiler import ASTSource
 from ldo_service.kernels.gpu import (
     blending,
     block_means,
+    equation_sums,
     loss,
     projection,
     projection_gradient,
+    residuals,
 )
 from ldo_service.kernels.gpu.arithmetic import PINNED
 from ldo_service.kernels.gpu.descent import CORRECTIONS
@@ -48,6 +50,7 @@ from ldo_service.kernels.gpu.plane_rendering import FOUR_WARPS, LANES
 CAPABILITIES = (75, 80, 86, 89, 90, 100, 120)
 TOOLS = Path(nvidia.__file__).parent / "bin"
 FLOATS, INTS, BYTES, INT, FLOAT = "*fp32", "*i32", "*u8", "i32", "fp32"
+DOUBLES = "*fp64"
 SPARE_REGISTERS = 8
 DIFFERING = re.compile(r"\b(fma\.|mad\.f|\S*\.approx|\S*\.ftz|div\.full|\S*tf32)\S*")
 
@@ -72,7 +75,8 @@ class Kernel:
 
     @property
     def name(self) -> str:
-        return self.function.__name__
+        suffix = ", strips" if self.constants.get("WITH_STRIPS") else ""
+        return self.function.__name__ + suffix
 
 
 KERNELS = (
@@ -183,6 +187,34 @@ KERNELS = (
         {"LAST_STEP": CORRECTIONS - 1, "ADAM": True, "BLOCK": LANES},
         FOUR_WARPS,
         (110, 113, 113, 113, 113, 116, 115),
+    ),
+    Kernel(
+        residuals.sum_residuals,
+        (FLOATS, INT, FLOATS, INT, INT, FLOATS, INT, FLOATS, FLOATS),
+        {"WITH_STRIPS": False, "BLOCK": equation_sums.POINT_LANES},
+        equation_sums.SUMMING,
+        (162, 164, 163, 163, 165, 166, 155),
+    ),
+    Kernel(
+        residuals.sum_residuals,
+        (FLOATS, INT, FLOATS, INT, INT, FLOATS, INT, FLOATS, FLOATS),
+        {"WITH_STRIPS": True, "BLOCK": equation_sums.POINT_LANES},
+        equation_sums.SUMMING,
+        (168, 168, 168, 168, 167, 168, 168),
+    ),
+    Kernel(
+        residuals.add_programs,
+        (FLOATS, INT, DOUBLES),
+        {"LANES": equation_sums.SUM_LANES},
+        blending.ONE_WARP,
+        (40, 42, 42, 42, 42, 42, 34),
+    ),
+    Kernel(
+        residuals.add_strips,
+        (FLOATS, BYTES, INT, DOUBLES),
+        {"LANES": equation_sums.STRIP_LANES},
+        FOUR_WARPS,
+        (64, 48, 48, 48, 48, 48, 48),
     ),
 )
 

@@ -25,7 +25,12 @@ if os.environ.get("LDO_ISA") != "baseline":
     pytest.skip(REASON + ", and LDO_ISA=baseline", allow_module_level=True)
 
 from ldo_service.evaluation import device_iteration  # noqa: E402, F401
-from ldo_service.kernels.gpu import descent, frame_loss, plane_rendering  # noqa: E402, F401
+from ldo_service.kernels.gpu import (  # noqa: E402
+    descent,  # noqa: F401
+    equation_sums,  # noqa: F401
+    frame_loss,  # noqa: F401
+    plane_rendering,
+)
 
 MAX_PAIRS = 150
 TURNED = se3.exp(np.array([0.15, -0.2, 0.1, 0.1, -0.15, 0.2]))

@@ -4,9 +4,18 @@ import numpy as np
 import pytest
 
 from ldo_service.kernels.gpu.arrays import Arrays, HostArray, HostArrays, TorchArrays
-from tests.kernels.gpu.scenes import ARRAYS, SCENES, descent, frame_loss, plane_rendering
+from tests.kernels.gpu.scenes import (
+    ARRAYS,
+    SCENES,
+    descent,
+    equation_sums,
+    frame_loss,
+    plane_rendering,
+)
 from tests.kernels.gpu.test_gradients import BETAS, EPSILON, PENALTY, state_of
 from tests.kernels.gpu.test_loss import IMAGES, WEIGHTS
+from tests.kernels.gpu.test_residuals import SCENES as ALIGNED
+from tests.kernels.gpu.test_residuals import equations_of, numbers_of
 
 
 class OtherwiseFilledArrays(HostArrays):
@@ -45,7 +54,8 @@ def results_of(arrays: Arrays, names: tuple[str, ...] = ("turned",)) -> list[np.
             weights = WEIGHTS.l1, WEIGHTS.d_ssim, WEIGHTS.depth
             by_loss, means = frame_loss.image_loss(arrays, rendering, frame, exposure, weights)
             out += [by_loss, arrays.upload(means)]
-    return [arrays.download(x) for x in out]
+    equations = numbers_of(equations_of(arrays, ALIGNED["holes"]))
+    return [*(arrays.download(x) for x in out), *equations]
 
 
 def assert_same_bits(first: list[np.ndarray], second: list[np.ndarray]) -> None:
@@ -76,6 +86,7 @@ def test_order_of_the_programs_has_no_effect(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(plane_rendering, "LANES", 32)  # More programs.
     monkeypatch.setattr(descent, "LANES", 32)
     monkeypatch.setattr(frame_loss, "PIXEL_LANES", 128)
+    monkeypatch.setattr(equation_sums, "POINT_LANES", 64)
     names = ("turned", *SQUARE_SCENES)
     forward = results_of(ARRAYS, names)
     set_place, is_moved = interpreter_builder.set_grid_idx, []

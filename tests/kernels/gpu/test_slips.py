@@ -8,13 +8,15 @@ from types import ModuleType
 
 import pytest
 
-from tests.kernels.gpu import agreement, scenes, test_gradients
-from tests.kernels.gpu.scenes import descent, frame_loss, plane_rendering
+from tests.kernels.gpu import agreement, scenes, test_gradients, test_residuals
+from tests.kernels.gpu.scenes import descent, equation_sums, frame_loss, plane_rendering
 from tests.kernels.gpu.test_blending import test_planes_equal_those_of_the_cpu as judge_planes
 from tests.kernels.gpu.test_gradients import test_derivatives_equal_those_of_the_cpu as judge_rows
 from tests.kernels.gpu.test_gradients import test_step_equals_the_step_of_the_cpu as judge_step
 from tests.kernels.gpu.test_loss import test_loss_equals_that_of_the_cpu as judge_loss
 from tests.kernels.gpu.test_projection import test_splats_equal_the_reference as judge_splats
+from tests.kernels.gpu.test_residuals import test_equations_equal_those_of_the_cpu as judge_sums
+from tests.kernels.gpu.test_residuals import test_points_that_are_not_finite_add_nothing
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]  # Minutes, on a busy machine.
 KERNELS = Path(descent.__file__).parent
@@ -62,6 +64,43 @@ SLIPS = {
         "x * by_squares",
         partial(judge_loss, "wide"),
     ),
+    "lever arm of the point instead of the surface": (
+        "residuals",
+        "turn = cross(n, q)",
+        "turn = cross(n, p)",
+        partial(judge_sums, "slope"),
+    ),
+    "late occlusion": (
+        "residuals",
+        "1.0 + tl.load(problem + 24)",
+        "1.5 + tl.load(problem + 24)",
+        partial(judge_sums, "holes"),
+    ),
+    "clipped pixel": ("residuals", "& (darkest > 0.0) ", "", partial(judge_sums, "holes")),
+    "point too close": (
+        "residuals",
+        "(z > NEAREST)",
+        "(z > 0.0)",
+        partial(judge_sums, "partly behind the camera"),
+    ),
+    "linear noise of depth": (
+        "residuals",
+        "growth * beyond * beyond",
+        "growth * beyond",
+        partial(judge_sums, "slope"),
+    ),
+    "strips of another cell": (
+        "residuals",
+        "live, 0) == cell)",
+        "live, 0) >= cell)",
+        partial(judge_sums, "slope"),
+    ),
+    "normal that is not finite": (
+        "residuals",
+        "& (size * 0.0 >= 0.0)",
+        "",
+        test_points_that_are_not_finite_add_nothing,
+    ),
 }
 
 
@@ -69,11 +108,14 @@ SLIPS = {
 def _fresh_results(monkeypatch: pytest.MonkeyPatch):
     """Compute all results again, and leave the planted differences out of the summary."""
     monkeypatch.setattr(agreement, "measured", {})
-    scenes.of_kernel.cache_clear()
-    test_gradients.gradients_of.cache_clear()
+    forget_results()
     yield
-    scenes.of_kernel.cache_clear()
-    test_gradients.gradients_of.cache_clear()
+    forget_results()
+
+
+def forget_results() -> None:
+    for cached in (scenes.of_kernel, test_gradients.gradients_of, test_residuals.of_kernel):
+        cached.cache_clear()
 
 
 def changed_module(name: str, text: str, folder: Path) -> ModuleType:
@@ -100,11 +142,10 @@ def test_planted_error_is_detected(
         folder = tmp_path / str(is_wrong)
         folder.mkdir()
         module = changed_module(name, content, folder)
-        for user in (plane_rendering, frame_loss, descent):
+        for user in (plane_rendering, frame_loss, descent, equation_sums):
             if hasattr(user, name):
                 monkeypatch.setattr(user, name, module)
-        scenes.of_kernel.cache_clear()
-        test_gradients.gradients_of.cache_clear()
+        forget_results()
         judge_must(judge, fail=is_wrong)
 
 

@@ -1,0 +1,125 @@
+"""Direct alignment on the device that the tracker uses.
+
+Conventions: `ldo_service.geometry`.
+"""
+
+import logging
+from collections.abc import Callable
+from typing import TypeVar
+
+import numpy as np
+
+from ldo_service.errors import DeviceError
+from ldo_service.kernels.gpu.arrays import Arrays
+from ldo_service.kernels.gpu.device import DeviceChoice, choose_device, on_cpu
+
+from .alignment import (
+    AlignConfig,
+    Alignment,
+    BrightnessModel,
+    Linearizer,
+    NormalEquations,
+    ResidualConfig,
+    align,
+    normal_equations,
+)
+from .pyramid import Level, Pyramid, ReferencePoints
+
+log = logging.getLogger(__name__)
+Found = TypeVar("Found")
+
+
+class Aligner:
+    """Direct alignment on a GPU or on the CPU.
+
+    If a GPU fails, the CPU repeats the current alignment and computes all later ones. Its results
+    do not depend on the alignments before it.
+
+    Args:
+        on_gpu: Computation of normal equations on a GPU, which raises DeviceError if the GPU fails;
+            None for the CPU.
+        device: Choice of the device; None if the program chose it.
+
+    Attributes:
+        device: Device of the alignment, with the reason for its choice.
+    """
+
+    def __init__(
+        self, on_gpu: Linearizer | None = None, device: DeviceChoice | None = None
+    ) -> None:
+        self._on_gpu = on_gpu
+        self.device = device or on_cpu("the program chose it.")
+
+    def align(
+        self,
+        reference: ReferencePoints,
+        frame: Pyramid,
+        T_camera_reference: np.ndarray,
+        config: AlignConfig,
+    ) -> Alignment:
+        """Align a frame to reference points; see `alignment.align`."""
+        return self._computed(
+            lambda linearize: align(reference, frame, T_camera_reference, config, linearize)
+        )
+
+    def linearize(
+        self,
+        points: np.ndarray,
+        target: Level,
+        T_camera_reference: np.ndarray,
+        appearance: BrightnessModel,
+        config: ResidualConfig,
+    ) -> NormalEquations:
+        """Linearize the residuals of a given pose; see `alignment.normal_equations`."""
+        return self._computed(
+            lambda linearize: linearize(points, target, T_camera_reference, appearance, config)
+        )
+
+    def _computed(self, compute: Callable[[Linearizer], Found]) -> Found:
+        if self._on_gpu is not None:
+            try:
+                return compute(self._on_gpu)
+            except DeviceError as error:
+                self._continue_on_cpu(error)
+        return compute(normal_equations)
+
+    def _continue_on_cpu(self, error: DeviceError) -> None:
+        self._on_gpu, self.device = None, self.device.failed(error)
+        log.error(
+            "tracker: %s The CPU aligns frames from now on, and no frame is lost. Restart the "
+            "service to use the GPU again.",
+            self.device.reason,
+            exc_info=error.__cause__,
+        )
+
+
+def choose_aligner(wanted: str) -> Aligner:
+    """Choose a device, and return the direct alignment on it.
+
+    A GPU is used if `wanted` is cuda, and if it passes the self-test. With auto, the CPU aligns
+    frames: no GPU has been measured yet, and a choice by a measurement at the start would change
+    the bits of the results from run to run.
+
+    Args:
+        wanted: Setting `service.device`.
+    """
+    if wanted == "auto":
+        return Aligner(
+            device=on_cpu(
+                "service.device=auto aligns on the CPU, because no GPU was measured to be faster. "
+                "`ldo bench --device cuda` measures yours, and service.device=cuda uses it."
+            )
+        )
+
+    def make(arrays: Arrays) -> Linearizer:
+        # Both modules import Triton, which is optional.
+        from .alignment_self_test import run_self_test
+        from .gpu_equations import GpuEquations
+
+        run_self_test(arrays)
+        return GpuEquations(arrays).normal_equations
+
+    return Aligner(*choose_device(wanted, "tracker", "frames are aligned", make))
+
+
+CPU_ALIGNER = Aligner()  # It has no state.
