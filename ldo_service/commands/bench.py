@@ -102,7 +102,7 @@ def bench(
 
     Set the environment variable LDO_ISA to avx512, avx2 or baseline to choose the instruction set.
     With --device cuda, the results of the GPU are compared with those of the CPU first. Nothing is
-    measured if they differ.
+    measured if they differ. The alignment of a frame by the tracker is measured too.
 
       ldo bench
       ldo bench --device cuda

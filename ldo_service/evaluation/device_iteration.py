@@ -1,8 +1,11 @@
-"""Times of an optimizer iteration on a GPU beside the CPU, after a comparison of the results."""
+"""Times on a GPU beside the CPU, after a comparison of the results.
+
+An iteration of the Gaussian optimizer and an alignment of the tracker are measured.
+"""
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,11 +17,15 @@ from ldo_service.gaussians.gpu_self_test import iterate, require_equal, run_self
 from ldo_service.gaussians.optimizer_backend import CpuBackend, OptimizerBackend, ShapeLimits
 from ldo_service.geometry import Camera
 from ldo_service.kernels.gpu.arrays import Arrays
+from ldo_service.tracking import alignment_self_test
+from ldo_service.tracking.alignment import AlignConfig, Linearizer, align, normal_equations
+from ldo_service.tracking.gpu_equations import GpuEquations
 
 from .iteration import Steps, medians_ms, noise_frame, walls
 
 ADAM, WEIGHTS = AdamConfig(), LossWeights(l1=0.8, d_ssim=0.2, depth=1.0)
 LIMITS = ShapeLimits(needle_weight=0.01, max_needle_ratio=4.0, max_sigma_px=20.0)
+ALIGNED_PX = 320, 240  # Size of the finest level of the tracker.
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +33,7 @@ class DeviceTimes:
     """Median times by stage in milliseconds, and the peak memory of the GPU.
 
     Attributes:
-        cpu_ms: Times on the CPU.
+        cpu_ms: Times on the CPU. "alignment" is that of a frame of ALIGNED_PX, not of the image.
         gpu_ms: Times on the GPU. The host waits for the GPU at the end of each stage.
         gpu_mb: Largest memory that arrays took on the GPU, MB; 0 in the interpreter of Triton.
     """
@@ -46,7 +53,7 @@ def device_times(
     self_test_repeats: int = 20,
     clock: Callable[[], float] = time.perf_counter,
 ) -> DeviceTimes:
-    """Measure an iteration on both devices, if their results agree.
+    """Measure an iteration and an alignment on both devices, if their results agree.
 
     Args:
         arrays: Arrays of the GPU.
@@ -61,6 +68,7 @@ def device_times(
         DeviceError: The GPU fails, or its results differ from those of the CPU.
     """
     run_self_test(arrays, self_test_repeats)
+    alignment_self_test.run_self_test(arrays, self_test_repeats)
     rows, (color, depth_m) = walls(n, camera), noise_frame(camera)
     view = TrainingView(0, camera, color, depth_m, np.eye(4))
     makers = (
@@ -82,7 +90,9 @@ def device_times(
         gaussians.add(rows, 0)
         backend.begin(gaussians)
         steps.append(stages(backend, view))
-    cpu_ms, gpu_ms = (with_sum(times) for times in medians_ms(steps, repeats, clock))
+    iterations = [with_sum(times) for times in medians_ms(steps, repeats, clock)]
+    alignments = medians_ms(alignment_steps(arrays), repeats, clock)
+    cpu_ms, gpu_ms = (a | b for a, b in zip(iterations, alignments, strict=True))
     return DeviceTimes(cpu_ms, gpu_ms, arrays.peak_bytes() / 1e6)
 
 
@@ -100,6 +110,29 @@ def stages(backend: OptimizerBackend, view: TrainingView) -> Steps:
         backend.descend(Exposure(), rate=0.1)
 
     return {"rendering and exposure": rendering, "loss and step": descent}
+
+
+def alignment_steps(arrays: Arrays) -> list[Steps]:
+    """Return the alignment of a new frame to known points, on the CPU and on the GPU.
+
+    Raises:
+        DeviceError: The results of the GPU differ from those of the CPU.
+    """
+    reference, frame = scene = alignment_self_test.make_scene(*ALIGNED_PX)
+    computed: list[Linearizer] = [normal_equations, GpuEquations(arrays).normal_equations]
+    wanted, got = (alignment_self_test.outcome(scene, linearize) for linearize in computed)
+    alignment_self_test.require_equal(got, wanted)
+
+    def alignment(linearize: Linearizer) -> Callable[[], object]:
+        def run() -> object:
+            # A copy of the texels is uploaded, as those of each frame of a camera are.
+            levels = [replace(level, texels=level.texels.copy()) for level in frame.levels]
+            new = replace(frame, levels=tuple(levels))
+            return align(reference, new, np.eye(4), AlignConfig(), linearize)
+
+        return run
+
+    return [{"alignment": alignment(linearize)} for linearize in computed]
 
 
 def with_sum(times_ms: dict[str, float]) -> dict[str, float]:

@@ -23,6 +23,8 @@ def _interpreter(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("ldo_service.commands.bench.find_gpu", "tests.bench.bench_gpu.required_gpu"):
         monkeypatch.setattr(name, lambda: GPU)
     monkeypatch.setattr(device_iteration, "run_self_test", lambda *_: None)
+    monkeypatch.setattr(device_iteration.alignment_self_test, "run_self_test", lambda *_: None)
+    monkeypatch.setattr(device_iteration, "ALIGNED_PX", (48, 36))
 
 
 def test_times_of_both_devices_are_measured(capsys: pytest.CaptureFixture[str]) -> None:
@@ -31,7 +33,10 @@ def test_times_of_both_devices_are_measured(capsys: pytest.CaptureFixture[str]) 
     facts = json.loads(out)
     assert facts["gpu"] == "interpreter"
     for times_ms in (facts["cpu_ms"], facts["gpu_ms"]):
-        assert set(times_ms) == {"rendering and exposure", "loss and step", "iteration"}
+        assert set(times_ms) == {
+            *("rendering and exposure", "loss and step", "iteration"),
+            "alignment",
+        }
         assert all(time_ms > 0 for time_ms in times_ms.values())
     assert facts["gpu_ms"]["iteration"] > facts["cpu_ms"]["iteration"]
 
@@ -44,6 +49,15 @@ def test_wrong_results_are_not_timed(
     code, _, err = ldo(capsys, *SMALL)
     assert code == 1
     assert "at 16x16 pixels with 30 Gaussians, the results are wrong, so no times are" in err
+
+
+def test_wrong_alignments_are_not_timed(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(device_iteration.alignment_self_test.TOLERANCE, "pose", 0.0)
+    code, _, err = ldo(capsys, *SMALL, "--repeats", "1")
+    assert code == 1
+    assert "pose differs by" in err
 
 
 def test_gpu_that_fails_the_self_test_is_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
