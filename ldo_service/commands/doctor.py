@@ -27,6 +27,7 @@ from ldo_service.schemas.topics import HEALTH
 from ldo_service.service.diagnostics import ActorStatus, diagnose, notes
 from ldo_service.service.forecast import forecast
 from ldo_service.service.state_forecast import forecast_of_state
+from ldo_service.tracking.aligner import choose_aligner
 from ldo_service.transport.endpoint import DEFAULT_ENDPOINT, Endpoint
 from ldo_service.transport.keys import TlsKeys, expiry_warning
 
@@ -62,7 +63,7 @@ EXTRAS = {  # Optional extra of the package: modules that it installs.
 }
 # Extras that are experimental.
 EXPERIMENTAL = {
-    "cuda": "Mapping on a GPU is experimental until `ldo bench --device cuda` has passed on it"
+    "cuda": "Computing on a GPU is experimental until `ldo bench --device cuda` has passed on it"
 }
 REINSTALL = "`.venv/bin/pip install -e .` in the clone of LDO-SLAM installs all libraries."
 # Time for which a running service is observed, seconds: six heartbeats, and six keyframes at 2 Hz.
@@ -188,6 +189,8 @@ def devices() -> Iterator[Finding]:
         f"service.device=auto chooses {choice.device} ({choice.name}) for the mapper: "
         f"{choice.reason}",
     )
+    aligned = choose_aligner("auto").device
+    yield Finding("note", f"{aligned.device} ({aligned.name}) for the tracker: {aligned.reason}")
     on_gpu = providers_of("auto")[0] == CUDA
     device, has = ("cuda", "has") if on_gpu else ("cpu", "lacks")
     yield Finding(

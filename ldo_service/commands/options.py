@@ -52,8 +52,8 @@ Device = Annotated[
     Literal["auto", "cpu", "cuda"] | None,
     argument(
         metavar="auto|cpu|cuda",
-        help="device of mapper and networks, instead of service.device; auto uses a GPU if it "
-        "passes a self-test (experimental)",
+        help="device of mapper, tracker and networks, instead of service.device; auto uses a GPU "
+        "if it passes a self-test, cuda also for the tracker (experimental)",
     ),
 ]
 Source = Annotated[

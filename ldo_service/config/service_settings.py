@@ -111,11 +111,11 @@ class OfflineSettings:
 
 @dataclass(frozen=True, slots=True)
 class ServiceSettings:
-    """Live service (`ldo serve`), and the device that computes map and networks."""
+    """Live service (`ldo serve`), and the device that computes map, poses and networks."""
 
-    # Device of the mapper's optimizer and of the networks. auto uses a GPU if it passes a
-    # self-test, and the CPU otherwise. Mapping on a GPU is experimental. openvino applies to the
-    # networks alone.
+    # Device of the mapper's optimizer, of the tracker's alignment and of the networks. auto uses a
+    # GPU if it passes a self-test, but aligns on the CPU. cuda also aligns on the GPU. Mapping and
+    # alignment on a GPU are experimental. openvino applies to the networks alone.
     device: Device = "cpu"
     # Actors that run in processes of their own. The default is the actor that uses gtsam, which
     # holds the GIL during every call.

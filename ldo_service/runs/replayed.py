@@ -128,8 +128,8 @@ def _gpu_caveat(about: Mapping[str, str]) -> list[str]:
         for facts in (recorded, ours)
     ]
     return [
-        f"recorded with {texts[0]}, replayed with {texts[1]}: the results of the mapper and of "
-        "networks may differ. Replay on an equal device with equal versions."
+        f"recorded with {texts[0]}, replayed with {texts[1]}: the results of mapper, tracker "
+        "and networks may differ. Replay on an equal device with equal versions."
     ]
 
 

@@ -102,8 +102,9 @@ def fail(*_: object) -> None:
 
 def test_devices_without_a_gpu_are_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ldo_service.kernels.gpu.device.find_gpu", missing_gpu)
-    mapper, networks = doctor.devices()
-    assert (mapper.mark, networks.mark) == ("note", "note")
+    mapper, tracker, networks = doctor.devices()
+    assert (mapper.mark, tracker.mark, networks.mark) == ("note", "note", "note")
+    assert "for the tracker: service.device=auto aligns on the CPU" in tracker.text
     assert mapper.text.startswith("service.device=auto chooses cpu (")
     assert mapper.text.endswith("for the mapper: there is no GPU.")
     assert "chooses cpu for the networks" in networks.text
@@ -113,7 +114,7 @@ def test_devices_without_a_gpu_are_the_cpu(monkeypatch: pytest.MonkeyPatch) -> N
 def test_gpu_that_fails_the_self_test_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ldo_service.kernels.gpu.device.find_gpu", gpu)
     monkeypatch.setattr("ldo_service.gaussians.gpu_self_test.run_self_test", fail)
-    mapper, _ = doctor.devices()
+    mapper, *_ = doctor.devices()
     assert mapper.mark == "warn"
     assert mapper.text.endswith("the GPU Some GPU failed: the loss differs.")
 
@@ -122,7 +123,7 @@ def test_gpu_that_fails_the_self_test_is_a_warning(monkeypatch: pytest.MonkeyPat
 def test_gpu_that_passes_the_self_test_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ldo_service.kernels.gpu.device.find_gpu", gpu)
     monkeypatch.setattr("ldo_service.gaussians.gpu_self_test.run_self_test", lambda _: None)
-    mapper, _ = doctor.devices()
+    mapper, *_ = doctor.devices()
     assert mapper.mark == "ok"
     assert "chooses cuda (Some GPU) for the mapper: the GPU passed the self-test." in mapper.text
 

@@ -1,4 +1,4 @@
-"""GPU kernels in Triton for the optimization of the map; they have not run on a GPU yet.
+"""GPU kernels in Triton for map optimization and alignment; they have not run on a GPU yet.
 
 `make gpu-check` runs each kernel in the interpreter of Triton, compares it with the C++ kernels and
 with the NumPy reference implementations, and compiles it for seven architectures. The service
@@ -9,6 +9,9 @@ modules with kernels does.
 - `projection`, `blending`: rendering of the image planes that the loss needs.
 - `loss`, `block_means`: image loss with its derivatives, and the block means for the exposure.
 - `projection_gradient`: derivatives with respect to the Gaussians, and a step of Adam.
+- `residuals`: residuals of the alignment and sums of their normal equations.
 - `arrays`: memory, sorting and sums, in NumPy for the interpreter and in torch for a GPU.
 - `plane_rendering`, `frame_loss`, `descent`: functions that launch the kernels of one iteration.
+- `equation_sums`: functions that launch the kernels of one step of the alignment.
+- `device`: search for a GPU, and choice between it and the CPU.
 """
