@@ -16,7 +16,6 @@ from tests.kernels.gpu.test_gradients import test_step_equals_the_step_of_the_cp
 from tests.kernels.gpu.test_loss import test_loss_equals_that_of_the_cpu as judge_loss
 from tests.kernels.gpu.test_projection import test_splats_equal_the_reference as judge_splats
 from tests.kernels.gpu.test_residuals import test_equations_equal_those_of_the_cpu as judge_sums
-from tests.kernels.gpu.test_residuals import test_points_that_are_not_finite_add_nothing
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]  # Minutes, on a busy machine.
 KERNELS = Path(descent.__file__).parent
@@ -99,7 +98,7 @@ SLIPS = {
         "residuals",
         "& (size * 0.0 >= 0.0)",
         "",
-        test_points_that_are_not_finite_add_nothing,
+        test_residuals.test_points_that_are_not_finite_add_nothing,
     ),
 }
 
