@@ -10,6 +10,7 @@ from weakref import ref
 
 import numpy as np
 
+from ldo_service.errors import DeviceError
 from ldo_service.kernels.gpu.arrays import Arrays
 from ldo_service.kernels.gpu.device import device_errors
 from ldo_service.kernels.gpu.equation_sums import (
@@ -44,7 +45,8 @@ class GpuEquations:
     that are not there yet, and 100 bytes. It downloads 51 numbers, with cells 896 numbers more.
 
     The results are bitwise equal on one GPU model and one version of Triton. They differ from those
-    of the CPU in the last bits. A point that is not finite is not visible and adds nothing.
+    of the CPU in the last bits. A residual adds nothing if its point, gray level or normal is not
+    finite.
 
     Args:
         arrays: Arrays of the device.
@@ -73,7 +75,7 @@ class GpuEquations:
 
         Raises:
             ValueError: An array has a wrong shape, or the transform is not rigid.
-            DeviceError: The device failed.
+            DeviceError: The device failed, or it returned NaN or infinity.
         """
         # The CPU checks the arguments: it takes no points, so this costs microseconds.
         normal_equations(NO_POINTS, target, T_camera_reference, appearance, config)
@@ -98,6 +100,9 @@ class GpuEquations:
                 problem,
                 None if cells is None else self._on_device("cells", cells, strip_cells),
             )
+        if not (np.isfinite(sums).all() and np.isfinite(by_cell).all()):
+            # The CPU repeats the alignment. The next pose would not be rigid, and the frame lost.
+            raise DeviceError("the sums of the alignment have NaN or infinity.")
         return _equations(sums, by_cell)
 
     def _on_device(
@@ -110,8 +115,10 @@ class GpuEquations:
         key = (kind, id(values))
         known = self._resident.get(key)
         if known is None or known[0]() is not values:
-            # The copy goes with the array of the host, whose id may then belong to another one.
-            forget = ref(values, lambda _: self._resident.pop(key, None))
+            # The copy goes with the array of the host, whose id may then belong to another one. A
+            # weak reference to the copies frees them at once after a failure of the device.
+            copies = ref(self._resident)
+            forget = ref(values, lambda _: (copies() or {}).pop(key, None))
             known = self._resident[key] = forget, self._arrays.upload(convert(values))
             self.uploaded += 1
         self._resident.move_to_end(key)

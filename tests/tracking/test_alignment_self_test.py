@@ -1,7 +1,8 @@
 """Self-test and failures of the alignment on a GPU, with the interpreter of Triton as the GPU."""
 
 import gc
-from collections.abc import Iterator
+import weakref
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -20,10 +21,17 @@ GUESS = se3.exp(alignment_self_test.XI)
 
 
 class ChangingArrays(FilledArrays):
-    """Arrays of a device that is lost, or whose results change, after a number of downloads."""
+    """Arrays of a device that is lost, or whose results change, after a number of downloads.
 
-    def __init__(self, downloads: float = np.inf, *, is_noisy: bool = False) -> None:
-        self.downloads, self.is_noisy, self.uploads = downloads, is_noisy, 0
+    `change` replaces later results; without it, the device is lost.
+    """
+
+    def __init__(
+        self,
+        downloads: float = np.inf,
+        change: Callable[[np.ndarray], np.ndarray] | None = None,
+    ) -> None:
+        self.downloads, self.change, self.uploads = downloads, change, 0
 
     def upload(self, values: np.ndarray) -> HostArray:
         self.uploads += 1
@@ -33,10 +41,19 @@ class ChangingArrays(FilledArrays):
         values = super().download(array)
         self.downloads -= 1
         if self.downloads < 0:
-            if not self.is_noisy:
+            if self.change is None:
                 raise RuntimeError("CUDA error: out of memory")
-            return np.nextafter(values, np.inf)
+            return self.change(values)
         return values
+
+
+def with_other_bits(values: np.ndarray) -> np.ndarray:
+    return np.nextafter(values, np.inf)
+
+
+def with_nan(values: np.ndarray) -> np.ndarray:
+    values[-1] = np.nan
+    return values
 
 
 @pytest.fixture(autouse=True)
@@ -66,7 +83,7 @@ def test_wrong_kernels_fail_the_self_test(monkeypatch: pytest.MonkeyPatch) -> No
 def test_results_that_change_fail_the_self_test() -> None:
     steady = ChangingArrays(1000)
     alignment_self_test.run_self_test(steady, 1)
-    noisy = ChangingArrays(1000 - steady.downloads, is_noisy=True)  # It changes afterwards.
+    noisy = ChangingArrays(1000 - steady.downloads, with_other_bits)  # Changes then.
     with pytest.raises(DeviceError, match="differ between two repetitions"):
         alignment_self_test.run_self_test(noisy, 2)
 
@@ -79,10 +96,16 @@ def test_lost_device_fails_the_self_test(monkeypatch: pytest.MonkeyPatch) -> Non
     assert "failed with RuntimeError: CUDA error: out of memory" in choice.reason
 
 
+@pytest.mark.parametrize(
+    ("change", "cause"), [(None, "out of memory"), (with_nan, "NaN or infinity")]
+)
 def test_alignment_of_a_lost_device_has_the_bits_of_the_cpu(
-    monkeypatch: pytest.MonkeyPatch, caplog
+    change: Callable[[np.ndarray], np.ndarray] | None,
+    cause: str,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog,
 ) -> None:
-    arrays = ChangingArrays()
+    arrays = ChangingArrays(change=change)
     gpu = Gpu("interpreter", {"triton": "3.7.1"}, arrays)
     monkeypatch.setattr("ldo_service.kernels.gpu.device.find_gpu", lambda: gpu)
     monkeypatch.setattr(alignment_self_test, "run_self_test", lambda _: None)
@@ -97,7 +120,7 @@ def test_alignment_of_a_lost_device_has_the_bits_of_the_cpu(
     repeated = aligner.align(*scene, GUESS, AlignConfig())
     assert arrays.downloads < 0
     assert aligner.device.metrics() == {"device_failed": 1, "on_gpu": 0}
-    assert "out of memory" in caplog.text
+    assert cause in caplog.text
     np.testing.assert_array_equal(repeated.T_reference_camera, on_cpu.T_reference_camera)
     np.testing.assert_array_equal(repeated.information, on_cpu.information)
 
@@ -114,6 +137,20 @@ def test_points_and_texels_are_uploaded_once() -> None:
     del scene
     gc.collect()
     assert not equations._resident  # The copies go with the arrays of the host.
+
+
+def test_copies_on_the_device_are_freed_without_the_garbage_collector() -> None:
+    scene = alignment_self_test.make_scene(48, 36)
+    equations = gpu_equations.GpuEquations(FilledArrays())
+    align(*scene, GUESS, AlignConfig(), equations.normal_equations)
+    copies = weakref.ref(equations._resident)
+    assert copies()
+    gc.disable()
+    try:
+        del equations
+        assert copies() is None
+    finally:
+        gc.enable()
 
 
 def test_arrays_beyond_the_limit_are_uploaded_again(monkeypatch: pytest.MonkeyPatch) -> None:
