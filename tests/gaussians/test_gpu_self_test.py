@@ -65,6 +65,7 @@ def test_kernels_pass_the_self_test() -> None:
     run_self_test(FilledArrays(), 2)
 
 
+@pytest.mark.slow
 def test_wrong_kernels_fail_the_self_test(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plane_rendering, "LOW_PASS", np.float32(0.3001))
     with pytest.raises(DeviceError, match=r".* differs by .* from the CPU"):

@@ -80,6 +80,7 @@ def test_wrong_kernels_fail_the_self_test(monkeypatch: pytest.MonkeyPatch) -> No
         alignment_self_test.run_self_test(FilledArrays(), 1)
 
 
+@pytest.mark.slow
 def test_results_that_change_fail_the_self_test() -> None:
     steady = ChangingArrays(1000)
     alignment_self_test.run_self_test(steady, 1)

@@ -67,6 +67,7 @@ def assert_same_bits(first: list[np.ndarray], second: list[np.ndarray]) -> None:
 SQUARE_SCENES = ("beyond the edges", "ties")  # Scenes of 16x16 pixels, so that the loss takes part.
 
 
+@pytest.mark.slow
 def test_second_run_has_the_same_bits() -> None:
     assert_same_bits(results_of(ARRAYS, SQUARE_SCENES), results_of(ARRAYS, SQUARE_SCENES))
 

@@ -70,6 +70,7 @@ def test_gpu_that_fails_the_self_test_is_not_timed(monkeypatch: pytest.MonkeyPat
         device_iteration.device_times(ARRAYS, 30, bench_camera(16, 16), 1)
 
 
+@pytest.mark.slow
 def test_program_prints_the_stages(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
