@@ -115,8 +115,8 @@ class FactorStore:
 
         One measurement from the first to the last keyframe replaces all measurements and closures
         within the group. Measurements from condensed keyframes to keyframes outside the group are
-        dropped, since the latter usually have others. If the graph would not be connected without a
-        measurement, the measurement is converted by `between_variables` and kept.
+        dropped, since those outside usually have others. If the graph would not be connected
+        without a measurement, it is converted by `between_variables` and kept.
 
         Args:
             group: Ids of the keyframes, in order.
@@ -143,8 +143,8 @@ class FactorStore:
     def restore_variable(self, keyframe: int) -> None:
         """Make a condensed keyframe a variable again.
 
-        Two measurements replace the one from the variable before it to the variable after it: to
-        the keyframe, and from the keyframe. The covariance of the replaced measurement is divided
+        The measurement from the variable before it to the variable after it is replaced by two: one
+        to the keyframe, and one from it. The covariance of the replaced measurement is divided
         between them in proportion to `CondensedKeyframes.fractions`.
         """
         row = self.rows[keyframe]

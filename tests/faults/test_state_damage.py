@@ -36,7 +36,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def state(made: Path, tmp_path: Path) -> Path:
-    """A copy of the state folder that tests may change."""
+    """A copy of the state folder, which tests may change."""
     return shutil.copytree(made, tmp_path / "copy")
 
 

@@ -54,7 +54,7 @@ class NoPipe:
 
 
 class SimulatedWorker:
-    """Thread of an actor; it runs each job after a random delay, between two callbacks."""
+    """Thread of an actor; each job runs after a random delay, as a callback of the event loop."""
 
     def __init__(self, loop: VirtualLoop, duration_s: Callable[[], float]) -> None:
         """Start without jobs.

@@ -26,7 +26,7 @@ C2 = tl.constexpr(0.03 * 0.03)
 
 @triton.jit
 def tap(k: tl.constexpr):
-    """Return the factor of the window for the pixel at k from its middle; all add up to 1."""
+    """Return the weight of the window at k pixels from its middle; all weights add up to 1."""
     if k == 0:
         return TAP0
     elif (k == 1) | (k == -1):  # noqa: RET505
