@@ -190,8 +190,8 @@ class QualitySettings:
 class DynamicsSettings:
     """Motion segmentation."""
 
-    # If True, moving surfaces are masked in tracking and in the map. If False, the world is assumed
-    # to be static.
+    # If True, moving surfaces are masked in tracking and in the map. If False, the tracker assumes
+    # a static world.
     enabled: bool = True
 
 

@@ -41,10 +41,10 @@ MIN_OBSERVED = 0.5
 # the kitchen and of `synthetic:twins`.
 MAX_THROUGH = 0.1
 MIN_MISSING = 0.3
-# An object is also missing if no two images of both places have at least this correlation, and one
-# of its images has a contrast of at least MIN_CONTRAST gray levels, about twice the noise of a
-# camera. Unrelated images have a correlation near 0. At right poses, the best one was at least 0.25
-# in 81 tests in the kitchen, and at least 0.36 in 1,758 tests in `synthetic:twins`, seeds 0 and 1.
+# An object is also missing if no two images of both places have at least this correlation, and
+# one image has a contrast of at least MIN_CONTRAST gray levels, about twice the noise of a camera.
+# Unrelated images have a correlation near 0. At right poses, the best one was at least 0.25 for
+# 81 tests of the kitchen, and at least 0.36 for 1,758 tests of `synthetic:twins`, seeds 0 and 1.
 MIN_CORRELATION = 0.2
 MIN_CONTRAST = 8.0
 # Two objects are at one place if the Bhattacharyya coefficient of their Gaussians is at

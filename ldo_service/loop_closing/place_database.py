@@ -131,8 +131,8 @@ class RetrievalMatch:
     layout: float  # Cosine of the histograms of pairs of labels and their distance.
     appearance: float  # Cosine of the visual-word histograms.
     # Score by which candidates are ranked: (appearance + (similarity + layout) / 2) / 2, if both
-    # subgraphs have detections and no setting excludes labels or images. It is 0 for a subgraph
-    # that is near but not similar.
+    # subgraphs have detections and no setting excludes labels or images. A subgraph that is near
+    # but not similar has a score of 0.
     score: float
     is_near: bool = False  # True if the poses in the map make it a candidate.
 

@@ -51,8 +51,8 @@ class ResidualConfig:
     noise: DepthNoise = field(default_factory=DepthNoise)
     # Largest depth difference between a point and its measured point q, as a fraction of depth.
     gate: float = 0.1
-    # Minimum distance of a hidden point behind the surface that the frame measures, as a fraction
-    # of the measured depth.
+    # Minimum distance of a hidden point behind the measured surface, as a fraction of the measured
+    # depth.
     occlusion: float = 0.08
 
     def __post_init__(self) -> None:

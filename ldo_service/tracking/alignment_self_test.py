@@ -23,9 +23,8 @@ REPEATS = 20
 WIDTH_PX, HEIGHT_PX = 48, 36  # The finest level has about 1,500 points.
 XI = np.array([0.004, -0.006, 0.003, 0.01, -0.008, 0.012])  # Motion of the camera.
 APPEARANCE = BrightnessModel(gain=0.9, bias=5.0, intensity_sigma=6.0, depth_noise_scale=1.5)
-# Largest differences that rounding explains. The largest ones that the interpreter of Triton gave
-# on this scene, compared with all three instruction sets of the CPU, are below a fifth of each
-# limit.
+# Largest differences that rounding explains. Triton's interpreter was compared with all three
+# instruction sets of the CPU: the differences are below a fifth of each limit.
 TOLERANCE = {
     "hessian": 1e-6,  # Relative to the norm, in units of the square roots of the diagonal.
     "gradient": 1e-6,

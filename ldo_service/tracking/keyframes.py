@@ -36,9 +36,9 @@ class KeyframeConfig:
     max_frames: int = 30
     # A relay is a reference that is used for tracking but not mapped. While the caller allows no
     # keyframe, as at held-out frames, a frame becomes a relay if its motion exceeds this multiple
-    # of max_rotation_rad or max_translation, or if its overlap is below min_overlap divided by this
-    # ratio. A ratio of 1 would make a relay of each such frame that needs a keyframe, and each
-    # relay adds a link to the chain of relative poses.
+    # of the limits above, or if its overlap is below min_overlap divided by this ratio. A ratio of
+    # 1 would make a relay of each such frame that needs a keyframe, and each relay adds a link to
+    # the chain of relative poses.
     relay_ratio: float = 1.5
     # The camera stands still if the overlap is above still_overlap, and rotation (rad) and
     # translation (fraction of the median depth) are below still_motion.
