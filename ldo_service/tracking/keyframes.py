@@ -35,10 +35,10 @@ class KeyframeConfig:
     # Maximum number of frames between reference keyframes while the camera moves.
     max_frames: int = 30
     # A relay is a reference that is used for tracking but not mapped. While the caller allows no
-    # keyframe, as at held-out frames, a frame becomes a relay if its motion exceeds this multiple
-    # of the limits above, or if its overlap is below min_overlap divided by this ratio. A ratio of
-    # 1 would make a relay of each such frame that needs a keyframe, and each relay adds a link to
-    # the chain of relative poses.
+    # keyframe, as at held-out frames, a frame becomes a relay if its motion exceeds the limits
+    # above times this ratio, or if its overlap is below min_overlap divided by it. A ratio of 1
+    # would make a relay of each such frame that needs a keyframe, and each relay adds a link to the
+    # chain of relative poses.
     relay_ratio: float = 1.5
     # The camera stands still if the overlap is above still_overlap, and rotation (rad) and
     # translation (fraction of the median depth) are below still_motion.
