@@ -9,7 +9,6 @@ import pytest
 from ldo_service.datasets import open_sequence
 from ldo_service.synthetic import FlatSequence
 from ldo_service.synthetic.flat import cache
-from ldo_service.synthetic.flat.__main__ import motion
 from ldo_service.synthetic.flat.corridor import (
     EQUAL,
     OBJECTS,
@@ -19,7 +18,8 @@ from ldo_service.synthetic.flat.corridor import (
     section_x_m,
 )
 from ldo_service.synthetic.flat.scene import Flat
-from ldo_service.synthetic.solids import vector
+
+from .walks import require_hand_held_walk
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -74,13 +74,4 @@ def test_walk_reaches_both_ends_and_sees_each_section_from_two_sides(exact: Flat
 
 
 def test_walk_is_hand_held_and_keeps_its_distance(exact: FlatSequence, corridor: Flat) -> None:
-    T = exact.truth().T_world_camera
-    moved_by = motion(T)
-    assert np.percentile(moved_by.speeds_m_s, 98) < 1.6
-    assert moved_by.turns_deg_s.max() < 110
-    eyes = vector(T[:, :3, 3].T)
-    solids = [panel.solid for panel in corridor.panels]
-    for solid in solids + [solid for thing in corridor.things for solid in thing.solids]:
-        local = np.abs(np.stack(solid.point_to_local(eyes)))
-        reach = 1 + 0.4 / np.array(solid.size_m)[:, None]
-        assert not (local < reach).all(axis=0).any(), solid
+    require_hand_held_walk(exact.truth(), corridor)

@@ -12,7 +12,6 @@ from ldo_service.datasets import open_sequence
 from ldo_service.geometry import se3
 from ldo_service.synthetic import FlatSequence
 from ldo_service.synthetic.flat import CLASS_NAMES, COCO_COUNT, cache
-from ldo_service.synthetic.flat.__main__ import motion
 from ldo_service.synthetic.flat.render import FlatRenderer
 from ldo_service.synthetic.flat.scene import Flat
 from ldo_service.synthetic.flat.twins import (
@@ -24,7 +23,8 @@ from ldo_service.synthetic.flat.twins import (
     section_x_m,
 )
 from ldo_service.synthetic.flat.twins_walk import STATIONS
-from ldo_service.synthetic.solids import vector
+
+from .walks import require_hand_held_walk
 
 SMALL = {"width_px": 80, "height_px": 60}
 # View from the doorway of office 0 into the office.
@@ -140,16 +140,7 @@ def test_walk_returns_to_offices_after_it_has_seen_their_twins(exact: FlatSequen
 
 
 def test_walk_is_hand_held_and_keeps_its_distance(exact: FlatSequence, twins: Flat) -> None:
-    T = exact.truth().T_world_camera
-    moved_by = motion(T)
-    assert np.percentile(moved_by.speeds_m_s, 98) < 1.6
-    assert moved_by.turns_deg_s.max() < 110
-    eyes = vector(T[:, :3, 3].T)
-    solids = [panel.solid for panel in twins.panels]
-    for solid in solids + [solid for thing in twins.things for solid in thing.solids]:
-        local = np.abs(np.stack(solid.point_to_local(eyes)))
-        reach = 1 + 0.4 / np.array(solid.size_m)[:, None]
-        assert not (local < reach).all(axis=0).any(), solid
+    require_hand_held_walk(exact.truth(), twins)
 
 
 @pytest.mark.slow
