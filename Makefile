@@ -43,7 +43,8 @@ clean:  ## remove .venv, build and dist
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade "pip>=25.1"
 	@touch $@
 
-# Without build isolation, later builds and the wheel of tests/test_packages.py reuse the objects.
+# Later builds and the wheel of tests/test_packages.py reuse the objects of this build, because it
+# has no isolated environment.
 .venv/installed: .venv/pip $(SOURCES)
 	$(BIN)/python -m pip install --quiet --group build
 	$(BIN)/python -m pip install --quiet --no-build-isolation -e .
