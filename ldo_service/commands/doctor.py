@@ -190,7 +190,11 @@ def devices() -> Iterator[Finding]:
         f"{choice.reason}",
     )
     aligned = choose_aligner("auto").device
-    yield Finding("note", f"{aligned.device} ({aligned.name}) for the tracker: {aligned.reason}")
+    yield Finding(
+        "note",
+        f"service.device=auto chooses {aligned.device} ({aligned.name}) for the tracker: "
+        f"{aligned.reason}",
+    )
     on_gpu = providers_of("auto")[0] == CUDA
     device, has = ("cuda", "has") if on_gpu else ("cpu", "lacks")
     yield Finding(

@@ -106,7 +106,7 @@ def choose_aligner(wanted: str) -> Aligner:
     if wanted == "auto":
         return Aligner(
             device=on_cpu(
-                "service.device=auto aligns on the CPU, because no GPU was measured to be faster. "
+                "no GPU has been measured to be faster. "
                 "`ldo bench --device cuda` measures yours, and service.device=cuda uses it."
             )
         )

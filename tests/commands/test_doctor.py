@@ -104,7 +104,7 @@ def test_devices_without_a_gpu_are_the_cpu(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr("ldo_service.kernels.gpu.device.find_gpu", missing_gpu)
     mapper, tracker, networks = doctor.devices()
     assert (mapper.mark, tracker.mark, networks.mark) == ("note", "note", "note")
-    assert "for the tracker: service.device=auto aligns on the CPU" in tracker.text
+    assert "for the tracker: no GPU has been measured to be faster" in tracker.text
     assert mapper.text.startswith("service.device=auto chooses cpu (")
     assert mapper.text.endswith("for the mapper: there is no GPU.")
     assert "chooses cpu for the networks" in networks.text
