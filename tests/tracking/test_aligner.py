@@ -168,7 +168,7 @@ def test_gpu_is_chosen_with_cuda_alone_if_it_passes_the_self_test(
     choice = choose_aligner(wanted).device
     if wanted == "auto":
         assert (choice.device, choice.has_failed) == ("cpu", False)
-        assert "no GPU was measured to be faster" in choice.reason
+        assert "no GPU has been measured to be faster" in choice.reason
     elif error:
         assert (choice.device, choice.has_failed) == ("cpu", True)
         assert choice.reason == "the GPU Some GPU failed: the pose differs."
