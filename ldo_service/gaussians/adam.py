@@ -231,15 +231,18 @@ class Adam:
 
         All other rows become zero.
         """
-        n = len(self._ids)
-        old_places, places = places_of_remaining(self._ids, ids)
+        n, common = len(self._ids), min(len(self._ids), len(ids))
+        differs = self._ids[:common] != ids[:common]
+        first = int(np.argmax(differs)) if differs.any() else common  # Earlier rows stay in place.
+        old_places, places = places_of_remaining(self._ids[first:], ids[first:])
         steps, self._steps = self._steps, np.zeros(len(ids), np.int32)
-        self._steps[places] = steps[old_places]
+        self._steps[:first] = steps[:first]
+        self._steps[first + places] = steps[first + old_places]
         self._reserve(len(ids))
         for moment in self._moments:
-            kept = moment[old_places]
-            moment[: max(n, len(ids))] = 0
-            moment[places] = kept
+            kept = moment[first + old_places]
+            moment[first : max(n, len(ids))] = 0
+            moment[first + places] = kept
 
     def _reserve(self, n: int) -> None:
         for k, moment in enumerate(self._moments):
