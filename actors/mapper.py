@@ -314,7 +314,7 @@ class Mapper(Actor):
             yield from self._order_labels()
 
     def _refit_idly(self) -> Iterator[Output]:
-        self._refit.while_idle(self.config.idle_thread_count())
+        self._refit.while_idle()
         self._idle_steps += 1
         is_done = not self._refit.has_work()
         if is_done:

@@ -24,7 +24,7 @@ class MapperConfig:
     min_iterations: int = 3
     # Folder of the keyframe images; empty: a temporary folder, or one in the state folder.
     folder: str = ""
-    threads: int = 0  # Threads of the renderer; 0: all cores but one, which the tracker needs.
+    threads: int = 0  # Threads of the renderer; 0: as many as the machine has cores.
     publish: PublishConfig = field(default_factory=PublishConfig)
     # Number of newest keyframes for which every relative-pose measurement is updated when the
     # renderer refines their poses. For an older keyframe, only the measurement relative to its
@@ -47,9 +47,5 @@ class MapperConfig:
             raise ConfigError(named(self, *counts) + " must be at least 1.")
 
     def thread_count(self) -> int:
-        """Return the number of renderer threads while keyframes arrive."""
-        return self.threads or max(1, (os.cpu_count() or 1) - 1)
-
-    def idle_thread_count(self) -> int:
-        """Return the number of refit threads while no keyframe arrives: all cores by default."""
+        """Return the number of threads of the renderer."""
         return self.threads or os.cpu_count() or 1

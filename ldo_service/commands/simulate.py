@@ -41,7 +41,7 @@ def simulate(
     max_frames: MaxFrames = None,
     stride: Stride = 1,
     threads: Annotated[
-        int | None, argument(metavar="T", help="threads of the renderer; 0: all cores but one")
+        int | None, argument(metavar="T", help="threads of the renderer; 0: one per core")
     ] = None,
     json_: Annotated[Json, argument(name="json")] = False,
 ) -> None:

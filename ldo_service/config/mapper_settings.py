@@ -191,7 +191,8 @@ class MapperSettings:
     # resolution. Most iterations use images of half the resolution and take less time, so about 35
     # iterations run with the default. It gives 12 frames per second on two cores at 640x480.
     iterations: NonNegativeInt = 12
-    # Threads of the renderer. 0 uses all cores but one, which is left for the tracker.
+    # Threads of the renderer. 0 uses as many as there are cores. The threads of the tracker have a
+    # higher priority.
     threads: NonNegativeInt = 0
     # Number of keyframes between checkpoints of the map. After a crash, up to this many keyframes
     # are mapped again.

@@ -91,15 +91,6 @@ class Fitting:
         """Device of the iterations."""
         return self._optimizer.device
 
-    @property
-    def threads(self) -> int:
-        """Number of threads of renderer and optimizer; the results do not depend on it."""
-        return self._optimizer.threads
-
-    @threads.setter
-    def threads(self, count: int) -> None:
-        self._optimizer.threads = count
-
     def forget_view(self, keyframe: int) -> None:
         """Drop the moments that the Gaussian optimizer keeps for the pose of a keyframe."""
         self._optimizer.forget_view(keyframe)

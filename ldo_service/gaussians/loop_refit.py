@@ -164,22 +164,13 @@ class LoopRefit:
         """
         return bool(self._to_deduplicate) or bool(self._resident_keyframes())
 
-    def while_idle(self, threads: int) -> None:
-        """Do a part of the pending deduplication and refit while no keyframe arrives.
-
-        Args:
-            threads: Threads during this call. There may be more than usual, since the tracker has
-                little to do meanwhile.
-        """
-        config, fitting = self.config, self._map.fitting
-        usual, fitting.threads = fitting.threads, threads
-        try:
-            self._deduplicate(config.deduplicated_per_keyframe, config.deduplication_iterations)
-            runnable = sum(self._pending[k] for k in self._resident_keyframes())
-            if runnable:
-                self.refine(min(config.iterations_while_idle, runnable))
-        finally:
-            fitting.threads = usual
+    def while_idle(self) -> None:
+        """Do a part of the pending deduplication and refit while no keyframe arrives."""
+        config = self.config
+        self._deduplicate(config.deduplicated_per_keyframe, config.deduplication_iterations)
+        runnable = sum(self._pending[k] for k in self._resident_keyframes())
+        if runnable:
+            self.refine(min(config.iterations_while_idle, runnable))
 
     def at_end(self) -> None:
         """Remove duplicate Gaussians at the end of the run, without iterations of the optimizer.

@@ -156,12 +156,8 @@ class GaussianOptimizer:
 
     @property
     def threads(self) -> int:
-        """Number of threads; it may change between calls."""
+        """Number of threads."""
         return self._backend.threads
-
-    @threads.setter
-    def threads(self, count: int) -> None:
-        self._backend.threads = count
 
     def optimize(
         self,

@@ -1,8 +1,6 @@
 """Execution of a run's actors on a logical clock in this process, with a record of outputs."""
 
-import os
 from collections.abc import Callable, Collection, Iterable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +42,7 @@ class ActorRun:
             without: Names of actors that do not run.
             observe: Called with each output of an actor and the tick of its delivery.
         """
-        parameters = actor_parameters(with_all_cores(config))
+        parameters = actor_parameters(config)
         actors = [actor for actor in make_actors(parameters) if actor.name not in without]
         self.actors = {actor.name: actor for actor in actors}
         self.record = RunWriter(folder, config_yaml(config), parameters.tracker)
@@ -117,16 +115,6 @@ class ActorRun:
         """Return percentiles of the durations of all steps so far, by actor."""
         steps_of = self._clock.step_ms()
         return {name: percentiles(steps) for name, steps in steps_of.items() if steps}
-
-
-def with_all_cores(config: Config) -> Config:
-    """Return the configuration with a renderer that may use every CPU core.
-
-    In a live service, the renderer leaves one core to the tracker. An offline run does not need
-    this, since no frame can be late.
-    """
-    threads = config.mapper.threads or os.cpu_count() or 1
-    return replace(config, mapper=replace(config.mapper, threads=threads))
 
 
 def refinements(iterations: int, stamp_ns: int) -> Iterator[RefineMap]:

@@ -28,7 +28,6 @@ from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.evaluation.views import EvaluatedFrames, evaluate_rendering
 from ldo_service.geometry import Trajectory
-from ldo_service.runs.actor_run import with_all_cores
 from ldo_service.runs.finished import read_run
 from ldo_service.runs.folder import prepare
 from ldo_service.runs.job import RunOptions
@@ -72,7 +71,6 @@ class Watched:
 
 def row(sequence: Sequence, config: Config, drift: Drift, folder: Path) -> str:
     """Run all actors once and return the row of the table."""
-    config = with_all_cores(config)
     parameters = actor_parameters(config)
     actors = {actor.name: actor for actor in make_actors(parameters)}
     actors["tracker"] = DriftingTracker(parameters.tracker, drift)

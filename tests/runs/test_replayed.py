@@ -49,7 +49,7 @@ def test_a_tracker_with_a_prior_replays(room: Sequence, tmp_path: Path) -> None:
 def test_replay_does_not_depend_on_the_number_of_threads(
     recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The recorded setting is "all cores but one", which depends on the machine."""
+    """The recorded setting is "one thread per core", which depends on the machine."""
     cores = os.cpu_count() or 1
     monkeypatch.setattr(os, "cpu_count", lambda: cores + 2)
     replay_recording(recording, "mapper")
