@@ -19,11 +19,11 @@ LARGE_SHARE = 0.01  # Minimum size of large crops: visible object pixels, fracti
 
 
 def naming_report(naming: Naming, is_large: np.ndarray) -> dict:
-    """Return the accuracies of the names of N crops, by the keys that `_totals` lists.
+    """Return the scores of the predicted names of N crops; `_totals` explains the keys.
 
     Args:
         naming: Predicted names of the crops.
-        is_large: Mask [N] of the large crops, which are also counted separately.
+        is_large: Mask [N] of the large crops, which also get separate scores.
     """
     large = Naming(naming.truth[is_large], naming.told[is_large], naming.confidence[is_large])
     coco = [name for name in encoder.NAMES if name in CLASS_NAMES[:COCO_COUNT]]
@@ -46,7 +46,7 @@ def naming_report(naming: Naming, is_large: np.ndarray) -> dict:
 
 
 def regions_report(naming: Naming) -> dict:
-    """Return the accuracies of the names of regions, by the keys that `_of_regions` lists.
+    """Return the scores of the predicted names of regions; `_of_regions` explains the keys.
 
     For a region without an object, each name that means "no object" (NO_THINGS) is correct.
     """
@@ -157,8 +157,8 @@ def _row(name: str, *values: float | str) -> str:
 TEXT = """\
 # The built-in demo networks
 
-These are small networks for the synthetic scenes of this package. With them, `ldo demo` shows the
-whole semantic path without a download. They do not work on real images. For real images, register a
+These are small networks for the synthetic scenes of this package. With them, `ldo demo` detects
+and names objects without a download. They do not work on real images. For real images, register a
 detector trained on COCO (`ldo models add`) and an image-text model.
 
 {note}| file | size |
@@ -215,7 +215,8 @@ eighth of their box. In the rooms, some crops show a bare wall, floor or ceiling
 |---|---|---|
 {totals}
 
-Names of the regions that `regions/geometric_segmentation.py` proposes in the held-out rooms:
+Scores of naming the regions that `regions/geometric_segmentation.py` proposes in the held-out
+rooms:
 
 | | rooms |
 |---|---|
@@ -228,7 +229,7 @@ boxes with a score of at least 0.25.
 |---|---|---|---|---|---|---|---|---|
 {detected}
 
-Fraction of crops that get their correct name among all names, by true name:
+Fraction of crops that get their correct name, by true name. The encoder chooses from all names.
 
 | | rooms | flat |
 |---|---|---|

@@ -14,8 +14,8 @@ def crop(image: np.ndarray, box_px: np.ndarray, side_px: int = INPUT_PX) -> np.n
 
     Args:
         image: Image [H, W, 3] uint8.
-        box_px: Box [4], x0, y0, x1, y1.
-        side_px: Side of the square.
+        box_px: Box [4], x0, y0, x1, y1, pixels.
+        side_px: Side of the square, pixels.
 
     Returns:
         The square [side_px, side_px, 3] uint8, with the crop in its center.
@@ -24,7 +24,7 @@ def crop(image: np.ndarray, box_px: np.ndarray, side_px: int = INPUT_PX) -> np.n
 
 
 def cut(image: np.ndarray, box_px: np.ndarray) -> np.ndarray:
-    """Return the part [h, w, ...] of an image [H, W, ...] inside a box; at least one pixel."""
+    """Return the part [h, w, ...] of an image [H, W, ...] in a box, at least one pixel."""
     last_px = np.array(image.shape[1::-1]) - 1
     x0, y0 = np.floor(np.clip(box_px[:2], 0, last_px)).astype(int)
     x1, y1 = np.ceil(np.minimum(box_px[2:], image.shape[1::-1])).astype(int)
@@ -32,9 +32,9 @@ def cut(image: np.ndarray, box_px: np.ndarray) -> np.ndarray:
 
 
 def resized(part: np.ndarray, side_px: int, is_ids: bool = False) -> np.ndarray:
-    """Resize an image so that its longer side has `side_px` pixels, with its aspect ratio.
+    """Resize an image to a longer side of `side_px` pixels, and keep its aspect ratio.
 
-    With `is_ids`, the values are ids and are not interpolated.
+    If `is_ids` is true, the values are ids, and the function does not interpolate them.
     """
     scale = side_px / max(part.shape[:2])
     width, height = (max(1, round(side * scale)) for side in part.shape[1::-1])
@@ -43,7 +43,7 @@ def resized(part: np.ndarray, side_px: int, is_ids: bool = False) -> np.ndarray:
 
 
 def framed(part: np.ndarray, side_px: int) -> np.ndarray:
-    """Return an image [h, w, 3] centered in a square of CLIP's mean color with side `side_px`."""
+    """Center an image [h, w, 3] in a square of side `side_px` that has CLIP's mean color."""
     canvas = np.full((side_px, side_px, 3), np.round(MEAN * 255), np.uint8)
     height, width = part.shape[:2]
     left, top = (side_px - width) // 2, (side_px - height) // 2
@@ -58,6 +58,6 @@ def enlarged(box_px: np.ndarray, margin: float) -> np.ndarray:
 
 
 def planes(crops: np.ndarray) -> np.ndarray:
-    """Return the network's input [N, 3, 64, 64] for crops [N, 64, 64, 3] uint8."""
+    """Return the image encoder's input [N, 3, 64, 64] for crops [N, 64, 64, 3] uint8."""
     values = ((crops / np.float32(255) - MEAN) / DEVIATION).astype(np.float32)
     return np.ascontiguousarray(values.transpose(0, 3, 1, 2))

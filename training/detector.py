@@ -1,9 +1,9 @@
 """Proposal network of the detector: every cell of three grids predicts the object that covers it.
 
 Each cell predicts the name of its object, as in semantic segmentation. Each cell also predicts the
-box of the object and the fit, which is the IoU of the predicted box with the true one. Every cell
-has a training target in every frame, so that few frames are enough. The network learns all names of
-the catalog, not only the names of COCO.
+box of the object and the fit, which is the IoU of the predicted box with the true box. Every cell
+has a training target in every frame, so few frames are enough for training. The network learns the
+names of all synthetic objects, not only those in COCO.
 """
 
 from collections.abc import Sequence
@@ -33,9 +33,10 @@ def network(net: JaxNetwork | Graph, image) -> list:
         image: Images [B, H, W, 3] in 0..1.
 
     Returns:
-        For each grid, an array [B, rows, columns, 5 + T + 1]. The channels are the distances from
-        the center of the cell to the left, top, right and bottom side of the box (in cells, minus
-        BOXES_CELLS), the logit of the fit, and the logits of the T names and the background.
+        For each grid, an array [B, rows, columns, 5 + T + 1]. Channels 0..3 are the distances from
+        the center of the cell to the left, top, right and bottom side of the box, in cells, minus
+        BOXES_CELLS. Channel 4 is the logit of the fit. The other channels are the logits of the T
+        names in THINGS and of the background.
     """
     fine, middle, coarse = _trunk(net, image)
     return [
@@ -86,7 +87,7 @@ def predicted(net: JaxNetwork, images):
 
     Returns:
         Boxes [B, N, 4] as x0, y0, x1, y1 in pixels, logits of the fit [B, N], and logits of the T
-        names and the background [B, N, T + 1].
+        names in THINGS and of the background [B, N, T + 1].
     """
     levels = network(net, images)
     flat = [level.reshape(level.shape[0], -1, level.shape[-1]) for level in levels]
@@ -98,7 +99,9 @@ def predicted(net: JaxNetwork, images):
 
 
 def loss(weights: Weights, batch: tuple):
-    """Add up the cross entropies of names and fits and the GIoU loss of boxes, all weighted.
+    """Return the weighted sum of three losses: of the names, of the fit and of the boxes.
+
+    The losses of names and fit are cross entropies. The loss of the boxes is the GIoU loss.
 
     Args:
         weights: Weights of the network.
@@ -158,7 +161,7 @@ def train(material: Views, steps: Sequence[int], seed: int) -> FirstStage:
 
     Args:
         material: Training frames.
-        steps: Steps of each round; see `training.ROUND_RATES`.
+        steps: Number of training steps of each of the two rounds.
         seed: Seed of weights and batches.
     """
     rng = np.random.default_rng([seed, 1])
@@ -176,7 +179,7 @@ def looked(graph: Graph) -> tuple[str, str, str]:
 
     Returns:
         Names of three tensors: boxes [1, N, 4] as x0, y0, x1, y1 in pixels, logits of the fit
-        [1, 1, N], and logits of the T names and the background [1, T + 1, N].
+        [1, 1, N], and logits of the T names in THINGS and of the background [1, T + 1, N].
     """
     rows = [
         graph.node("Reshape", level, graph.integers(1, sum(TOLD), -1))

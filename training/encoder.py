@@ -1,8 +1,8 @@
-"""Small dual encoder in the layout of CLIP, which embeds crops and names in a common space.
+"""Small dual encoder with CLIP's inputs and outputs: vectors of crops and names in one space.
 
 Input:
-    pixel_values: RGB [N, 3, 64, 64] with CLIP's mean and deviation; the crop is centered in a
-        square of that mean.
+    pixel_values: RGB [N, 3, 64, 64], normalized with CLIP's mean and standard deviation. Each crop
+        is centered in a square of CLIP's mean color.
 
 Output:
     image_embeds: Unit vectors [N, 96].
@@ -43,7 +43,7 @@ SMOOTHING = 0.05  # Label smoothing over all names.
 
 @dataclass(frozen=True, slots=True)
 class Framing:
-    """Random variation of a crop around its box."""
+    """Parameters of the random margin, offset and cut of the crop around a box."""
 
     margins: tuple[float, float]  # Range of the margin, as a fraction of the box's sides.
     jitter: float  # Maximum offset of each side, as a fraction of the box's sides.
@@ -61,7 +61,7 @@ def network(net: JaxNetwork | Graph, image) -> list:
         image: Normalized crops [N, H, W, 3].
 
     Returns:
-        Vectors [N, 1, 1, D].
+        Vectors [N, 1, 1, D] with D = DIMENSIONS.
     """
     x = residual(net, merged(net, image, "stem", 64, side=4), "stage4", 64)
     x = net.conv(x, "down8", 128, stride=2)
@@ -85,8 +85,8 @@ class Pair:
     def images(self, crops: np.ndarray, with_mirror: bool = True) -> np.ndarray:
         """Return unit vectors [N, D] of crops [N, 64, 64, 3] uint8.
 
-        With `with_mirror`, the vectors of the crop and of its mirror image are added and scaled to
-        unit length.
+        If `with_mirror` is true, the vectors of a crop and of its mirror image are added, and the
+        sum is scaled to unit length.
         """
         live = JaxNetwork(self.weights, self.statistics)
         sides = (crops, crops[:, :, ::-1])[: 1 + with_mirror]
@@ -214,7 +214,7 @@ def shown_in(
 def example(
     shown: Shown, before: Shown | None, side_px: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Return an augmented crop of `shown`, occluded by the object of `before` if it is given."""
+    """Return an augmented crop of `shown`, occluded by the object of `before` if not None."""
     color = recolor(shown.color, shown.plane, rng)
     if before is not None:
         _cover(color, before, rng)
@@ -275,12 +275,11 @@ def embedded(graph: Graph, crops: str, output: str = "", with_mirror: bool = Tru
     """Add the image encoder to an ONNX graph.
 
     Args:
-        graph: Writer of ONNX nodes that has the weights of the image encoder. The nodes are added
-            to its graph.
+        graph: Graph to which the nodes are added. It has the weights of the image encoder.
         crops: Name of the tensor of normalized crops [N, 3, H, W].
-        output: Name of the result; empty: an automatic name.
-        with_mirror: True: the vectors of a crop and of its mirror image are added and scaled to
-            unit length. False: the mirror image is not used.
+        output: Name of the resulting tensor; if empty, the graph chooses a name.
+        with_mirror: If true, the vectors of a crop and of its mirror image are added, and the sum
+            is scaled to unit length. If false, the mirror image is not used.
 
     Returns:
         Name of the tensor of unit vectors [N, D].

@@ -18,7 +18,7 @@ PADDING = 114  # Gray level outside the frame.
 
 @dataclass(frozen=True, slots=True)
 class Canvas:
-    """Size of a training image, and range of the factor by which the frame in it is scaled."""
+    """Size of a training image, and range of the random scale of the frame in the image."""
 
     size_px: tuple[int, int] = INPUT_PX  # Width and height, multiples of the widest cell.
     zoom: tuple[float, float] = (0.8, 1.5)  # Minimum and maximum.

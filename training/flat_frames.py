@@ -1,4 +1,4 @@
-"""Frames of the flat, used only for the final scores."""
+"""Frames of the sequence `synthetic:flat`, used only for the final scores."""
 
 import numpy as np
 import views
@@ -8,7 +8,7 @@ from ldo_service.synthetic.flat import FlatSequence
 
 
 def flat_frames(stride: int) -> tuple[list[np.ndarray], VisibleBoxes]:
-    """Return every `stride`-th frame of the flat, and the visible objects of these frames.
+    """Return every `stride`-th frame of `synthetic:flat`, and the visible objects of these frames.
 
     The frames are [H, W, 3] uint8 RGB, with the errors of the simulated camera.
     """

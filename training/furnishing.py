@@ -58,7 +58,7 @@ class Builder:
 
         Args:
             label: Class of the object.
-            heading: Direction of the object's x axis.
+            heading: Direction of the object's x axis, as a unit vector (x, y) in the world frame.
             shapes: Shapes to choose from; empty: all shapes of the class.
         """
         shape = int(self.rng.choice(shapes or range(SHAPES.get(label, 1))))
@@ -73,8 +73,8 @@ class Builder:
 
         Args:
             thing: The object at the origin.
-            places: Positions to try, in order, meters.
-            carrier: Object that the new one may collide with, because it carries the new one.
+            places: Positions x, y, z to try, in this order, meters.
+            carrier: Object that carries the new object and may therefore touch it.
 
         Returns:
             The placed object, or None if no position is free.

@@ -1,7 +1,7 @@
 """Classes of objects by location in a room.
 
-In each list, large objects come first, because they are placed first. A class that is listed twice
-may occur twice.
+Objects are placed in the order of these lists, which begin with large objects. A class that is
+listed twice may occur twice in a room.
 """
 
 SHAPES = {  # Number of shapes of each class; one for classes that are not listed.

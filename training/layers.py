@@ -27,7 +27,7 @@ class JaxNetwork:
     """Backend of a network that computes JAX arrays.
 
     Attributes:
-        weights: Weights by name, including those that were initialized.
+        weights: Weights by name, including those that the backend initialized.
         observed: Mean and variance of the batch in each normalized layer, by name.
     """
 
@@ -52,7 +52,7 @@ class JaxNetwork:
         self._rng = rng
 
     def conv(self, x, name: str, channels: int, stride: int = 1, size: int = 3):
-        """Apply a convolution of `size` x `size` pixels, batch normalization and ReLU."""
+        """Apply a convolution with a `size` x `size` kernel, batch normalization and ReLU."""
         y = self._convolved(x, name, channels, stride, size)
         mean, variance = self._moments(y, name)
         gain = self._weight(f"{name}.gain", np.ones(channels))
@@ -60,7 +60,7 @@ class JaxNetwork:
         return jax.nn.relu((y - mean) * (gain * jax.lax.rsqrt(variance + EPSILON)) + bias)
 
     def linear(self, x, name: str, channels: int, bias: float = 0.0):
-        """Apply a 1x1 convolution with bias, without normalization, for the network's outputs."""
+        """Apply a 1x1 convolution with bias and without normalization, as the output layer."""
         y = self._convolved(x, name, channels, 1, 1)
         return y + self._weight(f"{name}.bias", np.full(channels, bias))
 
@@ -126,8 +126,8 @@ class JaxNetwork:
 class Graph:
     """Backend of a network that builds an ONNX graph.
 
-    The normalization of a layer becomes a part of its convolution. The methods of layers are those
-    of `JaxNetwork`; they take and return names of tensors.
+    The convolution of a layer includes the normalization of the layer. The class has the same
+    methods for layers as `JaxNetwork`, but they take and return names of tensors.
     """
 
     def __init__(self, weights: Weights, statistics: Statistics) -> None:
@@ -205,7 +205,7 @@ class Graph:
         return self.constant(np.array(value, np.float32))
 
     def halved(self, values: np.ndarray) -> str:
-        """Add a constant in half precision, to halve the file's size, and a cast to float."""
+        """Add a constant in half precision, which halves the file's size, and a cast to float32."""
         return self.node("Cast", self.constant(values.astype(np.float16)), to=TensorProto.FLOAT)
 
     def constant(self, values: np.ndarray) -> str:
@@ -249,7 +249,7 @@ class Graph:
 
 
 def pads(size: int) -> list[tuple[int, int]]:
-    """Return the padding of rows and columns for a kernel of this side.
+    """Return the padding of rows and columns for a kernel of side `size`.
 
     The padding is symmetric, as in the ONNX nodes of `Graph`.
     """
@@ -280,8 +280,8 @@ def unfolded(x, size: int, stride: int):
 def merged(net: JaxNetwork | Graph, x, name: str, channels: int, side: int = 2):
     """Apply a patchify convolution: each square of `side` x `side` pixels becomes one pixel.
 
-    See Liu et al., ConvNeXt, CVPR 2022. Training takes a quarter of the time of a 3x3 convolution
-    with stride 2.
+    See Liu et al., ConvNeXt, CVPR 2022. Training of this layer takes a quarter of the time of a 3x3
+    convolution with stride 2.
     """
     return net.conv(net.folded(x, side), name, channels, size=1)
 

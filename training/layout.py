@@ -1,7 +1,7 @@
-"""Rooms for training, with the flat's catalog but other sizes, layouts and paints.
+"""Random rooms for training; they differ from `synthetic:flat` in size, layout and paints.
 
-World frame: z up, origin on the floor at the center of the room. The renderer of the flat has a
-lamp above the origin.
+The rooms have the same kinds of objects as `synthetic:flat`. In the world frame, z points up, and
+the origin is on the floor at the center of the room. The renderer has a lamp above the origin.
 """
 
 from collections.abc import Iterator

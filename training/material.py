@@ -1,4 +1,4 @@
-"""Training frames of many rooms. Several processes render the frames that are not stored yet."""
+"""Training frames of many rooms, rendered by several processes and stored in a folder."""
 
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from views import Views, VisibleBoxes
 
 @dataclass(frozen=True, slots=True)
 class Rooms:
-    """Set of rooms."""
+    """Set of rooms, defined by their seeds and the number of frames per room."""
 
     seeds: range  # Seed of each room.
     frames: int  # Number of frames per room.

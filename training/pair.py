@@ -1,9 +1,9 @@
 """The two training rounds of the dual encoder: first on objects, then on objects and regions.
 
-The service requests labels for region proposals, which it computes from geometry and color
-(`regions`). A third of the regions show no object, and a third show a part of an object. In the
-second round, half of the crops in each batch therefore show such regions. Regions without an object
-get an additional name.
+The service requests names for region proposals. The module `regions` computes the same proposals
+for training. A third of the regions show no object, and a third show a part of an object. In the
+second round, half of the crops in each batch therefore show regions. Regions without an object get
+the additional name NO_NAME.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -40,7 +40,7 @@ def train(material: Views, steps: Sequence[int], seed: int) -> Pair:
 
     Args:
         material: Training frames.
-        steps: Steps of each round; see `training.ROUND_RATES`.
+        steps: Number of training steps of each of the two rounds.
         seed: Seed of weights and batches.
     """
     rng = np.random.default_rng([seed, 2])
@@ -77,8 +77,8 @@ def growing(
 
     Args:
         source: Function that returns endless batches of crops with a given side in pixels.
-        sides: Sides of crops and fractions of the steps, as in SIDES.
-        steps: Steps of the round.
+        sides: Sides of the crops in pixels, each with its fraction of the steps.
+        steps: Number of steps of the round.
     """
     for side_px, share in sides[:-1]:
         yield from islice(source(side_px), round(share * steps))
@@ -99,7 +99,10 @@ def batches(material: Views, rng: np.random.Generator, side_px: int = INPUT_PX) 
 
 
 def named(regions: VisibleBoxes) -> tuple[VisibleBoxes, np.ndarray]:
-    """Return the regions in NAMES or without an object, and their index in (*NAMES, NO_NAME)."""
+    """Return the regions that have a name in NAMES or show no object, and their name indices.
+
+    The indices refer to (*NAMES, NO_NAME).
+    """
     own = {CLASS_NAMES.index(name): k for k, name in enumerate(NAMES)} | {NO_THING: len(NAMES)}
     chosen = regions.chosen(np.array([k in own for k in regions.class_ids.tolist()], bool))
     return chosen, np.array([own[k] for k in chosen.class_ids.tolist()], np.int64)
@@ -121,9 +124,10 @@ def crops_of(regions: VisibleBoxes, colors: Sequence[np.ndarray]) -> tuple[np.nd
 
 
 def is_right(names: np.ndarray) -> np.ndarray:
-    """Return the mask of the names that are correct for each region, [N, T + 1] bool.
+    """Return the mask [N, T + 1] of the correct names of each region.
 
-    For a region without an object, all names in NO_THINGS are correct.
+    The columns are the T names in NAMES, then NO_NAME. For a region without an object, all names in
+    NO_THINGS are correct.
 
     Args:
         names: True name of each region, [N], as an index in (*NAMES, NO_NAME).

@@ -37,10 +37,10 @@ def regions(frame: FlatRendering, lens: Camera, rng: np.random.Generator) -> Ite
         rng: Source of the errors.
 
     Yields:
-        Class id, instance id, x0, y0, x1, y1 of the box in pixels from the corner of the first
-        pixel, and number of the region's pixels on the object. A region without an object has the
-        class NO_THING, the instance 0, and the number of all of its pixels. A region that shows too
-        small a piece of its object is omitted.
+        One tuple per region: class id, instance id, x0, y0, x1, y1, number of pixels. The box is in
+        pixels from the corner of the first pixel. The number counts the region's pixels on the
+        object. A region without an object has the class NO_THING, the instance 0, and the number of
+        all its pixels. A region that shows only a small piece of its object is omitted.
     """
     sharp = np.floor(np.clip(frame.light, 0, 1) * 255 + 0.5).astype(np.uint8)
     measured_m = measured_depth_m(frame.depth_m, frame.light, lens.fx, rng)

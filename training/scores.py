@@ -1,6 +1,6 @@
-"""Scores of the exported files.
+"""Scores of the exported networks.
 
-The networks run in onnxruntime, without any code of the training.
+The networks run in onnxruntime and use no training code.
 """
 
 from collections.abc import Iterable
@@ -28,7 +28,7 @@ TOP_PX = (cells.INPUT_PX[1] - FRAME_PX[1]) // 2  # First row of the frame in the
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Detections in one frame of FRAME_PX."""
+    """Detections in one frame of size FRAME_PX."""
 
     boxes_px: np.ndarray  # Boxes [M, 4], x0, y0, x1, y1.
     scores: np.ndarray  # Scores [M].
@@ -53,7 +53,7 @@ def session(path: Path) -> onnxruntime.InferenceSession:
 
 
 def canvas(color: np.ndarray) -> np.ndarray:
-    """Return the detector's input [256, 320, 3] for a frame [H, W, 3] uint8 RGB of aspect 4:3."""
+    """Return the detector's input [256, 320, 3] for a 4:3 frame [H, W, 3] uint8 RGB."""
     whole = np.full((*cells.INPUT_PX[::-1], 3), examples.PADDING, np.uint8)
     whole[TOP_PX : TOP_PX + FRAME_PX[1]] = cv2.resize(color, FRAME_PX)
     return whole
@@ -63,15 +63,15 @@ def output(network: onnxruntime.InferenceSession, image: np.ndarray) -> np.ndarr
     """Run the detector on its input [256, 320, 3] uint8.
 
     Returns:
-        For each cell, cx, cy, w, h of its box in pixels and the scores of the C classes,
-        [N, 4 + C].
+        Array [N, 4 + C] with a row for each cell: cx, cy, w, h of its box in pixels, then the
+        scores of the C classes.
     """
     values = image.transpose(2, 0, 1)[None].astype(np.float32) / 255
     return np.asarray(network.run(None, {"images": values})[0])[0].T
 
 
 def find(network: onnxruntime.InferenceSession, color: np.ndarray) -> Found:
-    """Return the detections in a frame [H, W, 3] uint8 RGB of aspect 4:3."""
+    """Return the detections in a 4:3 frame [H, W, 3] uint8 RGB."""
     rows = output(network, canvas(color))
     class_ids, scores = rows[:, 4:].argmax(axis=1), rows[:, 4:].max(axis=1)
     corners = np.hstack((rows[:, :2] - rows[:, 2:4] / 2, rows[:, 2:4]))
@@ -92,7 +92,8 @@ def detection(
 ) -> dict[str, ClassScore]:
     """Return the scores of each class that occurs, by name.
 
-    Objects below SHARE_MIN are not counted, nor are the boxes that match them.
+    Objects smaller than the fraction SHARE_MIN of the image are not counted. Boxes that match these
+    objects are not counted either.
 
     Args:
         found: Detections of each frame.

@@ -1,7 +1,7 @@
 """Export of the detector in the layout of YOLOv8: proposals, rescored by the image encoder.
 
 Input:
-    images: RGB [1, 3, 256, 320] in 0..1, the frame centered on gray.
+    images: RGB [1, 3, 256, 320] in 0..1, with the frame in the center and gray around it.
 
 Output:
     output0: Array [1, 4 + C, 1680] of cx, cy, w, h in pixels of the input, then the scores of the C
@@ -12,7 +12,7 @@ the LOOKS most likely boxes again. The score of such a box is the class probabil
 networks times the predicted IoU of the box. All other boxes have score 0.
 
 Two-step detectors (Ren et al., NeurIPS 2015) work in this way. Here, however, the second step is a
-separate network that was trained on crops, which takes far fewer training steps.
+separate network. It is trained on crops, which takes far fewer training steps.
 """
 
 from pathlib import Path
@@ -40,8 +40,9 @@ def export(first: FirstStage, pair: Pair, scale: float, path: Path) -> None:
 
     Args:
         first: The proposal network.
-        pair: The dual encoder without NO_NAME, the name of regions that show no object.
-        scale: Calibrated scale of the pair's cosines.
+        pair: The dual encoder. Its names do not include NO_NAME, the name of regions that
+            show no object.
+        scale: Calibrated factor on the cosines of the dual encoder's vectors.
         path: File to write.
     """
     graph = Graph(first.weights, first.statistics)
@@ -69,14 +70,15 @@ def output(
 
     Args:
         first: The proposal network.
-        pair: The dual encoder without NO_NAME, the name of regions that show no object.
-        scale: Calibrated scale of the pair's cosines.
+        pair: The dual encoder. Its names do not include NO_NAME, the name of regions that
+            show no object.
+        scale: Calibrated factor on the cosines of the dual encoder's vectors.
         image: Image [H, W, 3] uint8.
         is_chosen: Mask [N] of the cells to rescore.
 
     Returns:
-        For each cell, cx, cy, w, h of its box in pixels and the scores of the C classes,
-        [N, 4 + C].
+        Array [N, 4 + C] with a row for each cell: cx, cy, w, h of its box in pixels, then the
+        scores of the C classes.
     """
     corners, fit, logits = (part[0] for part in first.look(image[None]))
     cells = np.flatnonzero(is_chosen)

@@ -1,13 +1,13 @@
-"""Training of the built-in networks of the semantic path, with export and scores.
+"""Training, export and scoring of the built-in networks: a detector and a dual encoder.
 
     python training/train_demo.py [--out DIR] [--work DIR] [--share SHARE]
 
 The program runs these steps:
 
-1. Render rooms other than the flat, in two processes.
+1. Render random rooms in two processes.
 2. Train the detector's proposal network and the dual encoder in parallel, one thread each.
 3. Calibrate the confidences on separate rooms, and write the ONNX files.
-4. Score the files on a third set of rooms and, at the very end, on the flat.
+4. Score the files on a third set of rooms and, at the very end, on `synthetic:flat`.
 
 No choice depends on the final scores. Two runs on one machine write the same bytes.
 """
@@ -61,7 +61,7 @@ log = logging.getLogger(__name__)
 
 
 def main() -> None:
-    """Render the rooms, train and export the networks, and write their scores and the card."""
+    """Render the rooms, train and export the networks, and write their scores and model card."""
     given = _arguments()
     given.out.mkdir(parents=True, exist_ok=True)
     started = time.monotonic()

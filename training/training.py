@@ -43,15 +43,15 @@ def fit_in_rounds(
 ) -> Weights:
     """Fit the weights in consecutive rounds, each with its own warm-up and decay.
 
-    The rate rises again in the next round, so that the weights may leave a local minimum and reach
-    a better one (Loshchilov and Hutter, SGDR, ICLR 2017).
+    The rate rises again in each round, so that the weights may leave a local minimum and reach a
+    better minimum (Loshchilov and Hutter, SGDR, ICLR 2017).
 
     Args:
         loss: Function of weights and a batch.
         weights: Initial weights.
         batches: Batches of each round.
         steps: Steps of each round.
-        rate: Learning rate; ROUND_RATES are the fractions for each round.
+        rate: Learning rate. Each round uses its fraction of this rate in ROUND_RATES.
     """
     for source, count, share in zip(batches, steps, ROUND_RATES, strict=True):
         weights = fit(loss, weights, source, count, share * rate)
@@ -59,7 +59,7 @@ def fit_in_rounds(
 
 
 def fit(loss: Callable, weights: Weights, batches: Iterable, steps: int, rate: float) -> Weights:
-    """Minimize `loss(weights, batch)` by one step per batch.
+    """Minimize `loss(weights, batch)` with one gradient step per batch.
 
     Args:
         loss: Function of weights and a batch.
@@ -105,10 +105,10 @@ def fit(loss: Callable, weights: Weights, batches: Iterable, steps: int, rate: f
 
 
 def pace(number: int, steps: int) -> float:
-    """Return the fraction of the full rate at a step: rising, constant for most steps, falling.
+    """Return the learning rate of a step as a fraction of the full rate.
 
-    The training before the decay does not depend on when the decay begins (Hu et al., MiniCPM,
-    2024).
+    The rate first rises, then stays constant, and falls at the end. The training before the decay
+    does not depend on when the decay begins (Hu et al., MiniCPM, 2024).
 
     Args:
         number: Step, from 1.

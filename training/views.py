@@ -1,4 +1,4 @@
-"""Frames of rooms at the size of the networks' input, with boxes of the visible objects."""
+"""Frames of rooms, with the boxes of visible objects and of region proposals."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -62,7 +62,7 @@ class VisibleBoxes:
 
     @staticmethod
     def of(table: np.ndarray) -> "VisibleBoxes":
-        """Return the boxes of a table [B, 8], the inverse of `table`."""
+        """Return the boxes of a table [B, 8] that `table()` returned."""
         ids = table[:, :3].astype(np.int64)
         return VisibleBoxes(*ids.T, table[:, 3:7], table[:, 7])
 
@@ -78,7 +78,7 @@ class Views:
 
 
 def camera() -> Camera:
-    """Return the intrinsics of all frames, which have the flat's field of view."""
+    """Return the intrinsics of all frames, with the field of view of `synthetic:flat`."""
     focal_px = FOCAL_PER_WIDTH * WIDTH_PX
     center_px = (WIDTH_PX - 1) / 2, (HEIGHT_PX - 1) / 2
     return Camera(WIDTH_PX, HEIGHT_PX, focal_px, focal_px, *center_px)
@@ -130,8 +130,8 @@ def seen_in(
 
     Args:
         planes: Class ids [H, W] and instance ids [H, W] of each frame.
-        rng: Random generator of image rectangles. Those that show a bare wall, floor or ceiling are
-            returned as boxes of this class, besides the objects. None returns objects only.
+        rng: Random generator of image rectangles. Rectangles that show a bare wall, floor or
+            ceiling are returned as boxes of this class. If None, only objects are returned.
     """
     rows = [
         (frame, *row)
