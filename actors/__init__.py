@@ -1,1 +1,1 @@
-"""Actors of the service; each one converts messages (`schemas`) and calls the algorithms."""
+"""Actors of the service, each of which handles messages (`schemas`) by calling the algorithms."""

@@ -75,7 +75,7 @@ class FrameSourceConfig:
 class FrameSource(Actor):
     """Actor that pairs, checks and rectifies camera frames.
 
-    It counts unusable frames and logs the first one of each series.
+    It counts unusable frames. It logs only the first of several unusable frames in a row.
     """
 
     name = "frame_source"

@@ -84,7 +84,7 @@ class PendingKeyframe:
     def facts(self) -> tuple[int, int, int]:
         """Frame number, stamp in ns and image width in pixels, for the saved state.
 
-        The record in `place` is saved as a separate part.
+        The keyframe record `place` is saved as a separate part of the state.
         """
         return self.frame, self.stamp_ns, self.width_px
 

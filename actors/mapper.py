@@ -306,7 +306,7 @@ class Mapper(Actor):
         return self._has_urgent_work() or self._ordered.has_work()
 
     def on_idle(self) -> Iterator[Output]:
-        """Refit the map after corrections, send label requests, and correct late labels."""
+        """Refit the corrected map, send label requests, and repeat labelling with late results."""
         yield from self._label_requests()
         if self._refit.has_work():
             yield from self._refit_idly()

@@ -84,7 +84,7 @@ class OptimizerConfig:
 class Optimizer(Actor):
     """Actor that optimizes the pose graph.
 
-    It alone decides the poses of keyframes in the map and which submaps are merged.
+    No other actor computes keyframe poses in the map or decides which submaps are merged.
     """
 
     name = "optimizer"
@@ -334,8 +334,9 @@ class Optimizer(Actor):
     def snapshot(self) -> dict[str, Any]:
         """Return the state in three parts: `graph`, `landmarks` and `rest`.
 
-        `graph` is the pose graph at its last rebuild. It stays the same object until the next
-        rebuild, some keyframes later. `rest` has the changes since the last rebuild.
+        `graph` is the pose graph at the last rebuild of its solver. Snapshots share this object
+        until the next rebuild, some keyframes later. `rest` has the changes of the pose graph since
+        the last rebuild, and all other state.
         """
         graph = self._graph.snapshot()
         rest = {
@@ -373,7 +374,7 @@ class Optimizer(Actor):
         self._classes = list(saved["classes"])
 
     def metrics(self) -> dict[str, float]:
-        """Return counters of the pose graph, closures, landmarks and submaps."""
+        """Return counters of the pose graph, loop closures, landmarks and submaps."""
         graph = self._graph
         return {
             "keyframes": len(graph),

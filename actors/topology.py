@@ -1,7 +1,7 @@
 """Graph of actors: every actor with its ports and its factory.
 
-The diagram and the topic table of the documentation are generated from `GRAPH`. `ldo topics` prints
-both, with `--mermaid` and `--markdown`.
+The diagram and the topic table of the documentation are generated from `GRAPH`. The command
+`ldo topics --mermaid` prints the diagram, and `ldo topics --markdown` prints the table.
 """
 
 from collections.abc import Callable, Iterable
@@ -22,7 +22,7 @@ from ldo_service.schemas import topics as t
 
 @dataclass(frozen=True, slots=True)
 class ActorParameters:
-    """Parameter object of each actor; the defaults are those of the configuration."""
+    """Parameter objects of all actors; the defaults are those of the configuration."""
 
     frame_source: FrameSourceConfig = field(default_factory=FrameSourceConfig)
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
@@ -146,7 +146,7 @@ def topics_table() -> str:
 
 
 def mermaid_diagram(boxes: Iterable[ActorSpec] = GRAPH) -> str:
-    """Return the graph in Mermaid, with dashed arrows for inputs with policy Latest."""
+    """Return the graph in Mermaid, with solid arrows for inputs with the policy Lossless."""
     lines = ["flowchart LR", "    camera([camera])", "    odometry([other odometry])"]
     boxes = tuple(boxes)
     lines.extend(f"    {box.name}" for box in boxes)

@@ -4,8 +4,8 @@ Topics, their messages, the delivery policy of each input (with its queue length
 
 in   frame/rgbd       FrameRgbd        Latest(1)    a late frame is worth less than the next one
 in   graph/correction GraphCorrection  Latest(1)    has all poses, so the newest suffices
-in   odometry/prior   OdometryPrior    Latest(64)   0.3 s at 200 Hz, the time to track a frame;
-                                                    older poses may be dropped
+in   odometry/prior   OdometryPrior    Latest(64)   at 200 Hz, 64 poses cover 0.3 s, the
+                                                    time in which a frame is tracked
 in   detection/boxes  DetectionBoxes   Latest(1)    dynamic objects are masked for tracking
 out  pose/tracked     TrackedPose                   one for every tracked frame
 out  keyframe/new     Keyframe                      made only if the mapper has granted credit
@@ -83,8 +83,8 @@ OWN_PARTS = "keyframe", "supporting"
 class CameraExtrinsics:
     """Pose of the camera on the robot: T_base_camera.
 
-    `camera` has the optical axes of this project: x right, y down, z forward. For a base with x
-    forward and z up (REP-103), a forward-looking camera has quaternion 0.5 -0.5 0.5 -0.5.
+    The camera frame has x right, y down and z forward. If the base frame has x forward and z up
+    (REP-103), the quaternion (w x y z) of a forward-looking camera is 0.5 -0.5 0.5 -0.5.
     """
 
     # Camera center in the base frame, meters.
@@ -175,7 +175,7 @@ class Tracker(Actor):
     def handle(
         self, message: FrameRgbd | GraphCorrection | OdometryPrior | DetectionBoxes
     ) -> Iterator[TrackedPose | Keyframe | KeyframeMeasurements]:
-        """Yield the pose of a frame; if it becomes a keyframe, yield the keyframe first."""
+        """Yield the pose of a frame; if the frame becomes a keyframe, yield the keyframe first."""
         if isinstance(message, OdometryPrior):
             self._take_prior(message)
             return

@@ -91,7 +91,7 @@ class VlmLabeller(Actor):
             log.error("vlm_labeller disabled: %s Regions get no open-vocabulary label.", error)
 
     def handle(self, message: LabelRequest | AddLabel) -> Iterator[LabelResult | LabelNames]:
-        """Yield the label of the requested region, or all names after adding one."""
+        """Yield the label of a requested region, or all known names after adding a name."""
         match message:
             case LabelRequest():
                 yield self._answer(message)
@@ -209,9 +209,9 @@ def labeller_from_config(config: VlmLabellerConfig) -> Labeller | None:
 def require_labeller(config: VlmLabellerConfig) -> None:
     """Check that the configured labeller can be used.
 
-    This function does not contact the server of a labeller; the first label request does. An
-    offline run calls this function first, and does not start after an error. A live service starts
-    without a labeller instead.
+    This function does not contact the server of a labeller; the first label request does. If the
+    labeller cannot be used, an offline run does not start. A live service starts without a labeller
+    instead.
 
     Raises:
         ConfigError: The labeller cannot be used.

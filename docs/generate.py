@@ -1,8 +1,8 @@
-"""Generator of those parts of the pages whose text comes from the code.
+"""Generator of the parts of the documentation pages that come from the code.
 
 `python docs/generate.py` replaces the text between `<!-- NAME -->` and `<!-- end -->` in each page
-and draws `docs/actors.svg`. With `--check` it changes nothing and exits with 1 if a file would
-change.
+and draws `docs/actors.svg`. With `--check` it changes nothing, and exits with code 1 if a page or
+the drawing is out of date.
 """
 
 import ast
@@ -38,7 +38,7 @@ COMMAND = re.compile(r"^(?:\s+\S|ldo )")
 
 
 def packages_table() -> str:
-    """Return Markdown: every package with the first sentence of its docstring."""
+    """Return a Markdown table of all packages with the first sentence of each docstring."""
     lines = ["| package | contents |", "|---|---|"]
     lines += [f"| `{name}/` | {_first_sentence(path)} |" for name, path in _packages()]
     return "\n".join(lines)
@@ -58,7 +58,7 @@ def _first_sentence(path: Path) -> str:
 
 
 def public_settings() -> str:
-    """Return Markdown: a table of the public settings for each section of the configuration."""
+    """Return Markdown with one table of public settings per section of the configuration."""
     titles, lines, section = section_titles(), list[str](), ""
     for setting in settings_of(Config()):
         if not setting.is_public:
@@ -73,7 +73,7 @@ def public_settings() -> str:
 
 
 def settings_count() -> str:
-    """Return a sentence with the numbers of settings."""
+    """Return a sentence that counts the public and advanced settings, and the paper's constants."""
     settings = settings_of(Config())
     public = sum(setting.is_public for setting in settings)
     paper = sum(setting.path.startswith("paper.") for setting in settings)
@@ -89,7 +89,7 @@ def _unit(path: str) -> str:
 
 
 def messages() -> str:
-    """Return Markdown: each message, and each record in a message, with a table of its fields."""
+    """Return Markdown with a table of fields for each message and each record in a message."""
     topics: dict[str, list[str]] = {}
     for topic in TOPICS:
         for message in filter(None, (topic.message, topic.answer)):
@@ -110,7 +110,7 @@ def messages() -> str:
 
 
 def types() -> str:
-    """Return Markdown: a table of the type aliases in `schemas`, such as `Box`.
+    """Return a Markdown table of the type aliases in `schemas`, such as `Box`.
 
     Fields of messages use these types. Record types (structs) are not in the table.
     """
@@ -179,7 +179,7 @@ def _comment_of(field: ast.AnnAssign | ast.Assign, comments: dict[int, tuple[str
 
 
 def commands() -> str:
-    """Return Markdown: every verb of `ldo` with its help and a table of its arguments."""
+    """Return Markdown with the help and a table of arguments for each subcommand of `ldo`."""
     lines = list[str]()
     for name, verb in cli.verbs().items():
         lines += [f"## ldo {name}", "", *_help(verb), *_arguments(verb)]
@@ -278,7 +278,11 @@ WIDTH_PX, HEIGHT_PX, COLUMN_PX, ROW_PX = 120, 34, 170, 62
 
 
 def drawing() -> str:
-    """Return an SVG of the actors: solid arrows are lossless, dashed ones keep only the newest."""
+    """Return an SVG drawing of the actors and their connections.
+
+    A solid arrow stands for at least one topic with the policy Lossless. A dashed arrow stands for
+    topics with other policies.
+    """
     arrows = dict[tuple[str, str], bool]()
     for line in mermaid_diagram().splitlines():
         if found := re.match(r"\s+(\w+) (-->|-\.->)\|[^|]+\| (\w+)", line):
@@ -355,7 +359,7 @@ BLOCKS: dict[str, Callable[[], str]] = {
 
 
 def generated(page: str) -> str:
-    """Return the page with the text of each block replaced by the output of its function.
+    """Return the page with the text of each block replaced by the output of its `BLOCKS` function.
 
     Raises:
         KeyError: The page has an unknown block.
@@ -371,7 +375,7 @@ def _escaped(text: str) -> str:
 
 
 def outputs() -> Iterator[tuple[Path, str]]:
-    """Yield each generated file with the text that it must have."""
+    """Yield the path of each generated file and its up-to-date text."""
     yield from ((page, generated(page.read_text())) for page in PAGES)
     yield DOCS / "actors.svg", drawing()
 

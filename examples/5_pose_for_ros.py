@@ -1,11 +1,12 @@
-"""Bridge that publishes the camera pose on /tf of ROS 2, through zenoh-bridge-ros2dds.
+"""Publisher of the camera pose on /tf of ROS 2, through the bridge zenoh-bridge-ros2dds.
 
-The program publishes the transforms `ldo_map` to `ldo_odom` to `ldo_camera` as CDR on the Zenoh key
-`tf`. The bridge forwards them to the ROS topic `/tf` while that topic has subscribers. The axes of
-`ldo_map` and `ldo_odom` are those of the camera at its first pose: x right, y down, z forward.
+The program publishes two transforms as CDR on the Zenoh key `tf`: `ldo_odom` in its parent frame
+`ldo_map`, and `ldo_camera` in its parent frame `ldo_odom`. The bridge forwards them to the ROS
+topic `/tf` while that topic has subscribers. The axes of `ldo_map` and `ldo_odom` are those of the
+camera at its first pose: x right, y down, z forward.
 
-Run `.venv/bin/pip install -e '.[ros2]'`. Start `ldo serve`, a camera, such as `ldo publish
-synthetic:room`, and the bridge: `zenoh-bridge-ros2dds -m client -e tcp/127.0.0.1:7447`. Then run:
+Run `.venv/bin/pip install -e '.[ros2]'`. Start `ldo serve` and a camera, such as `ldo publish
+synthetic:room`. Start the bridge: `zenoh-bridge-ros2dds -m client -e tcp/127.0.0.1:7447`. Then run:
 
     .venv/bin/python examples/5_pose_for_ros.py [POSES]
 """

@@ -1,4 +1,4 @@
-"""Layout of recordings that a separate package adds to `ldo run`.
+"""Example of a separate package that adds a layout of recordings to `ldo run`.
 
 The recording is a file .npz with the arrays color [N, H, W, 3] uint8 and depth_mm [N, H, W] uint16,
 stamps_ns [N] int64, and camera [6]: width, height, fx, fy, cx, cy. The package registers LAYOUT in
@@ -28,7 +28,7 @@ class NumpySequence(Sequence):
                 self._color, self._depth_mm, stamps_ns, camera = (file[name] for name in NAMES)
         except (OSError, ValueError, KeyError) as error:
             raise DataError(
-                f"{path} cannot be read ({error}). It needs: {', '.join(NAMES)}."
+                f"{path} cannot be read ({error}). Give a .npz with arrays {', '.join(NAMES)}."
             ) from error
         width, height, fx, fy, cx, cy = camera.tolist()
         camera = Camera(int(width), int(height), fx, fy, cx, cy)

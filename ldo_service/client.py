@@ -83,7 +83,7 @@ class Client:
             color: RGB image, [H, W, 3], uint8.
             depth: Depth registered to the color image, [H, W], uint16 or float32; 0 or NaN where
                 unknown.
-            camera: Intrinsics.
+            camera: Intrinsics of the color camera.
             depth_scale: Units of `depth` per meter.
             stamp_ns: Time of the exposure, ns; the current time by default.
 
@@ -103,7 +103,7 @@ class Client:
     def publish_color(
         self, color: np.ndarray, camera: CameraModel, stamp_ns: int | None = None
     ) -> None:
-        """Send a color image; the camera sends its depth images separately with `publish_depth`.
+        """Send a color image, whose depth image is sent separately by `publish_depth`.
 
         The arguments are those of `publish`.
         """
@@ -215,7 +215,7 @@ class Client:
             yield inbox
 
     def latest(self, topic: Topic | str, timeout_s: float = 3.0) -> list[Message]:
-        """Request the last value of a state topic.
+        """Request the last value of a state topic, which is a topic that keeps its last value.
 
         Args:
             topic: The topic or its name.
@@ -225,7 +225,7 @@ class Client:
             The messages of the value, several for a map snapshot; empty if there is no value yet.
 
         Raises:
-            ConfigError: No topic has this name, or the topic is not a state topic.
+            ConfigError: No topic has this name, or the topic keeps no last value.
         """
         topic = _topic(topic)
         if not topic.is_state:
@@ -248,9 +248,9 @@ class Client:
         if "mapper" in self.live_actors():
             raise ConfigError(
                 "the map has no objects yet. Objects appear with the first keyframe that a "
-                "detector has processed. They need a detector: start the service with "
-                "`ldo serve --set detector.model=...`; `ldo models` shows how. A service that "
-                "only localizes publishes no objects; they are in the folder of its map."
+                "detector has processed. If no detector runs, start the service with `ldo serve "
+                "--set detector.model=NAME`; `ldo models list` lists the names. A service with "
+                "--localize publishes no objects; they are in the folder of its map."
             )
         raise self._no_service("replies", MAP_OBJECTS)
 

@@ -55,7 +55,7 @@ class EndpointError(ConfigError):
 
 
 class UnavailableError(ConfigError):
-    """Port, router or state folder that cannot be used now; a later attempt may succeed."""
+    """Network port, Zenoh router or state folder that cannot be used now, but perhaps later."""
 
     exit_code = 6
 
@@ -65,9 +65,9 @@ class ModelError(ConfigError):
 
 
 class DeviceError(LdoError):
-    """Device that is missing, has failed, has too little memory, or gives wrong results.
+    """Compute device, such as a GPU, that is missing, fails, lacks memory or gives wrong results.
 
-    Callers continue on the CPU.
+    The service continues on the CPU; `ldo bench` stops.
     """
 
 
@@ -92,7 +92,7 @@ class StageError(LdoError):
 
 
 class RestartsExhausted(StageError):
-    """Failure of an actor that failed more often than `supervision.max_restarts` allows."""
+    """Too many failures of an actor: more than `supervision.max_restarts` allows."""
 
     def __init__(self, actor: str, restarts: int, window_s: float) -> None:
         super().__init__(
@@ -103,7 +103,7 @@ class RestartsExhausted(StageError):
 
 
 class StageStalled(StageError):
-    """An actor exceeded the time limit of a step; a step is the handling of one message."""
+    """Step of an actor that exceeds its time limit; a step is the handling of one message."""
 
     def __init__(self, actor: str, age_s: float, setting: str) -> None:
         super().__init__(
@@ -142,18 +142,18 @@ def named(parameters: object, *fields: str) -> str:
 
 
 def install_command(extra: str) -> str:
-    """Return the command that installs an extra of the package, as a part of an error text."""
+    """Return the pip command that installs an optional extra of the package, for an error text."""
     return f"`.venv/bin/pip install -e '.[{extra}]'` in the clone of LDO-SLAM"
 
 
 def did_you_mean(name: str, known: Iterable[str], otherwise: str, prefix: str = "") -> str:
-    """Return a sentence that suggests the known name most similar to an unknown one.
+    """Return a sentence that suggests the known name most similar to an unknown name.
 
     Args:
         name: The unknown name.
         known: The known names.
-        otherwise: The sentence if no known name is similar.
-        prefix: Text before the suggested name, such as the path of its section.
+        otherwise: The sentence to return if no known name is similar.
+        prefix: Text before the suggested name, such as the configuration section `mapper.`.
     """
     near = get_close_matches(name, known, 1)
     return f"Did you mean {prefix}{near[0]}?" if near else otherwise

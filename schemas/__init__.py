@@ -1,9 +1,10 @@
-"""Messages between the actors and to other programs; imports msgspec and numpy only.
+"""Messages between the actors and to other programs.
 
-A message is one frozen, tagged struct. It is sent as a MessagePack map from the names of the
-struct's fields to their values, plus `type`, the name of the struct. Any MessagePack library can
-read this map. New fields are added at the end and with a default; the meaning of a field never
-changes. Conventions of frames and units are those of `ldo_service.geometry`.
+A message is a frozen msgspec struct. It is sent as a MessagePack map, which any MessagePack library
+can read. The map has an entry for each field of the struct, and the entry `type` with the name of
+the struct. New fields are added at the end and have a default. The meaning of a field never
+changes. `ldo_service.geometry` describes the frames and units. The package imports msgspec and
+numpy only.
 """
 
 from ldo_service.schemas.array import Array

@@ -16,7 +16,7 @@ MAX_LENGTH = 1 << 32  # Maximum length of a dimension; it also limits the shape 
 class Array(msgspec.Struct, frozen=True):
     """Little-endian array in C order.
 
-    With NumPy: `np.frombuffer(data, dtype).reshape(shape)`.
+    `np.frombuffer(data, dtype).reshape(shape)` converts the fields into a NumPy array.
     """
 
     dtype: DType
@@ -40,7 +40,7 @@ class Array(msgspec.Struct, frozen=True):
     def of(cls, values: np.ndarray) -> "Array":
         """Return an array with a copy of `values`.
 
-        Later changes of `values` therefore do not affect the message.
+        Later changes of `values` do not affect the returned array.
 
         Raises:
             ValueError: If the dtype is not one of `DTYPES`.
@@ -54,7 +54,7 @@ class Array(msgspec.Struct, frozen=True):
     def numpy(self) -> np.ndarray:
         """Return the array as a read-only NumPy view, without a copy.
 
-        The memory of the view may be unaligned if the message was received.
+        The memory of the view may be unaligned if the array was decoded from a received message.
         """
         view = np.frombuffer(self.data, "<" + self.dtype).reshape(self.shape)
         view.flags.writeable = False

@@ -6,12 +6,12 @@ from ldo_service.schemas.message import Message
 class ControlRequest(Message, frozen=True, kw_only=True):
     """Command to the service, sent as the payload of a Zenoh query on the topic control.
 
-    stamp_ns is the time of sending by the clock of the sender, or 0. Commands:
+    stamp_ns is the time of sending, by the clock of the sender; it may also be 0. The commands are:
 
     pause    the service drops and counts all frames from now on
     resume   the service accepts frames again
     save     every actor writes a checkpoint of its whole state now
-    reset    every actor restarts with an empty state and a new epoch, as if it had just started
+    reset    every actor restarts with an empty state, as if it started for the first time
     """
 
     command: str  # An unknown command is answered with the list of known commands.

@@ -13,8 +13,8 @@ TOLERANCE_PX = 1e-3  # Rounding may move a box beyond the image edge by this muc
 class Detection(msgspec.Struct, frozen=True, kw_only=True):
     """Box of an object with label and score.
 
-    Pixel centers are at integer coordinates. A box around the single pixel x = 3, y = 5 is
-    therefore 2.5, 4.5, 3.5, 5.5.
+    Pixel centers are at integer coordinates. A box around the single pixel x = 3, y = 5 therefore
+    has the edges x0 = 2.5, y0 = 4.5, x1 = 3.5, y1 = 5.5.
     """
 
     label: str  # Lower case, single spaces; synonyms of a class share one label.

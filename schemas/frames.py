@@ -1,4 +1,4 @@
-"""RGB-D frames: raw from a camera, as one message or as two, and rectified."""
+"""RGB-D frames: raw frames of a camera, in one or two messages, and rectified frames."""
 
 from typing import Literal
 
@@ -54,7 +54,8 @@ BYTES_PER_PIXEL: dict[str, int] = {"rgb8": 3, "bgr8": 3, "z16": 2, "f32": 4}
 class Image(msgspec.Struct, frozen=True, kw_only=True):
     """Image, raw or compressed.
 
-    The pixels of a compressed image are not checked here but at decompression.
+    The constructor checks the size of the image. The pixels of a compressed image are checked when
+    the image is decompressed.
     """
 
     encoding: ImageEncoding
@@ -93,7 +94,7 @@ class Image(msgspec.Struct, frozen=True, kw_only=True):
 class CameraRgbd(Message, frozen=True, kw_only=True):
     """Raw RGB-D frame of a camera program, published on camera/rgbd; depth is registered to color.
 
-    stamp_ns is the time of the exposure, by the clock of the camera.
+    stamp_ns is the time of the exposure of the frame, by the clock of the camera.
     """
 
     frame: int  # Number of the frame, counted by the camera program; gaps are dropped frames.
@@ -134,9 +135,9 @@ class CameraColor(Message, frozen=True, kw_only=True):
 class CameraDepth(Message, frozen=True, kw_only=True):
     """Raw depth image of a camera program, published on camera/depth.
 
-    stamp_ns is the time of exposure of the depth image. If `camera` equals the color camera and
-    T_color_depth is the identity, depth is registered already. Otherwise, the service registers the
-    depth image to the color image.
+    stamp_ns is the time of exposure of the depth image. The depth image counts as registered to the
+    color image if `camera` equals that of the color image and T_color_depth is the identity.
+    Otherwise, the service registers the depth image.
     """
 
     # Number of the image, counted by the camera program; images are paired by stamp, not by number.
@@ -166,11 +167,11 @@ class FrameRgbd(Message, frozen=True, kw_only=True):
 
 
 def require_color(image: Image, camera: CameraModel) -> None:
-    """Raise ValueError unless a color image fits its camera and encoding."""
+    """Raise ValueError unless a color image has its camera's size and an encoding for color."""
     if (image.width, image.height) != (camera.width, camera.height):
         raise ValueError(
-            f"color of {image.width}x{image.height} and its camera of "
-            f"{camera.width}x{camera.height} pixels differ in size"
+            f"color image of {image.width}x{image.height} pixels and its camera model of "
+            f"{camera.width}x{camera.height} pixels differ in size; both must be equal"
         )
     if image.encoding not in ("rgb8", "bgr8", "jpeg", "png"):
         raise ValueError(
@@ -179,14 +180,17 @@ def require_color(image: Image, camera: CameraModel) -> None:
 
 
 def require_depth(image: Image, camera: CameraModel, depth_scale: float) -> None:
-    """Raise ValueError unless a depth image fits its camera, encoding and scale."""
+    """Raise ValueError if the size, encoding or scale of a depth image is invalid.
+
+    The size must be that of the camera, the encoding one for depth, and the scale positive.
+    """
     require_finite("depth_scale", (depth_scale,))
     if depth_scale <= 0:
         raise ValueError(f"depth_scale is {depth_scale:g}, must be positive")
     if (image.width, image.height) != (camera.width, camera.height):
         raise ValueError(
-            f"depth of {image.width}x{image.height} and its camera of "
-            f"{camera.width}x{camera.height} pixels differ in size"
+            f"depth image of {image.width}x{image.height} pixels and its camera model of "
+            f"{camera.width}x{camera.height} pixels differ in size; both must be equal"
         )
     if image.encoding not in ("png", "z16", "z16+zstd", "f32", "f32+zstd"):
         raise ValueError(
@@ -195,9 +199,12 @@ def require_depth(image: Image, camera: CameraModel, depth_scale: float) -> None
 
 
 def require_rgbd(camera: CameraModel, color: Array, depth_m: Array) -> None:
-    """Raise ValueError unless color [H, W, 3] and depth [H, W] fit a rectified camera."""
+    """Raise ValueError unless camera, color [H, W, 3] and depth [H, W] form a rectified frame.
+
+    The camera must have no distortion. Color and depth must have the size of the camera.
+    """
     if camera.distortion:
-        raise ValueError("the camera of a rectified frame must have no distortion")
+        raise ValueError("camera of a rectified frame has distortion, must have none")
     size = (camera.height, camera.width)
     color.require("color", "u1", (*size, 3))
     depth_m.require("depth_m", "f4", size)

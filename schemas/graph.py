@@ -1,4 +1,4 @@
-"""Output of the pose-graph optimizer: poses of keyframes and landmarks in the map."""
+"""Output of the pose-graph optimizer: keyframe poses and landmarks in the map frame."""
 
 import msgspec
 import numpy as np
@@ -32,10 +32,10 @@ class GraphLandmark(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class GraphCorrection(Message, frozen=True, kw_only=True):
-    """Poses of all keyframes in the map, published on graph/correction.
+    """Poses of all keyframes in the map frame, published on graph/correction.
 
-    The poses are in the map frame, not relative to earlier messages. The newest message therefore
-    replaces all earlier messages. The poses take 56 bytes per keyframe.
+    The poses are not relative to earlier messages. The newest message therefore replaces all
+    earlier messages of graph/correction. The poses take 56 bytes per keyframe.
     """
 
     graph_version: int  # Version of the poses, ascending.
@@ -55,8 +55,8 @@ class GraphCorrection(Message, frozen=True, kw_only=True):
         require_count("last_refinement", self.last_refinement)
         if any(not 0 <= older < submap for submap, older in self.merged_submaps):
             raise ValueError(
-                f"merged_submaps is {self.merged_submaps}, must be pairs of a submap and an older "
-                "one that it is merged into"
+                f"merged_submaps is {self.merged_submaps}; each pair must hold the number of a "
+                "merged submap, then the smaller number of an older submap"
             )
         self.keyframes.require("keyframes", "i8", (None,))
         count = self.keyframes.shape[0]

@@ -1,4 +1,4 @@
-"""Heartbeat of an actor, published twice a second by its stage, even while the stage waits."""
+"""Heartbeat of an actor, published twice a second, even while the actor has nothing to do."""
 
 from typing import Literal
 
@@ -8,7 +8,7 @@ from ldo_service.schemas.message import Message, require_count, require_finite
 
 
 class InputCount(msgspec.Struct, frozen=True, kw_only=True):
-    """Counters of an input since the stage started."""
+    """Counters of an input of an actor since the stage, its runtime, started."""
 
     topic: str
     delivered: int  # Messages handled by the actor.
@@ -24,7 +24,7 @@ class InputCount(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class OutputCount(msgspec.Struct, frozen=True, kw_only=True):
-    """Counters of an output since the stage started."""
+    """Counters of an output of an actor since the stage, its runtime, started."""
 
     topic: str
     sent: int
@@ -42,8 +42,8 @@ class OutputCount(msgspec.Struct, frozen=True, kw_only=True):
 class Health(Message, frozen=True, kw_only=True):
     """Heartbeat of an actor, published on health/<actor>.
 
-    A stage is the runtime around an actor. stamp_ns is the stamp of the last message that the actor
-    handled.
+    A stage is the runtime around an actor, and publishes its heartbeat. stamp_ns is the stamp of
+    the last message that the actor handled.
     """
 
     actor: str

@@ -18,9 +18,10 @@ def message_types() -> tuple[type[Message], ...]:
 def json_schema() -> dict[str, object]:
     """Return one document with the JSON Schemas of all messages.
 
-    `$defs` contains the schema of each message, by name. `topics` refers to the message of each
-    topic. `answers` refers to the reply of each topic that takes requests by query. JSON Schema
-    describes binary fields as base64 strings; in MessagePack, these fields have the type `bin`.
+    `$defs` maps the name of each message to its schema. `topics` maps each topic to the schema of
+    its messages. `answers` maps each topic that takes requests by query to the schema of the reply.
+    JSON Schema describes binary fields as base64 strings; in MessagePack, these fields have the
+    type `bin`.
     """
     _, definitions = msgspec.json.schema_components(message_types())
     for definition in definitions.values():

@@ -38,15 +38,17 @@ NO_TERMS: Terms = (0.0, 0.0, 0.0)
 class CameraCorrection(msgspec.Struct, frozen=True, kw_only=True):
     """Correction that the self-calibration of the camera applied to color and depth.
 
-    For an image of width w with the center (cu, cv), x = (u - cu) / (w/2) and y = (v - cv) / (w/2).
-    r is the distance from the center, 1 in the corners. The corrected depth z fulfills 1/z =
-    1/z_measured + b1 x^2 + b2 x y + b3 y^2. The vignetting V of a channel is given by log V =
-    a1 r^2 + a2 r^4 + a3 r^6. The corrected color is the measured color times V_min / V. V_min is
-    the smallest V of the channel in the image, so the correction clips no color.
+    A pixel (u, v) of an image with width w and center (cu, cv) has the coordinates x =
+    (u - cu) / (w/2) and y = (v - cv) / (w/2). Its distance r from the center is scaled to 1 in the
+    corners. The corrected depth z follows from 1/z = 1/z_measured + b1 x^2 + b2 x y + b3 y^2. The
+    vignetting V of a channel follows from log V = a1 r^2 + a2 r^4 + a3 r^6. The corrected color is
+    the measured color times V_min / V. V_min is the smallest V of the channel in the image, so the
+    correction clips no color.
 
-    The three times are those of the camera's shutter, 0 until they are estimated. Color and depth
-    are compensated as if all rows had been recorded at one instant, unless the motion of the camera
-    was unknown.
+    readout_s, depth_readout_s and depth_delay_s are times of the camera's shutter. They are 0 until
+    the self-calibration has estimated them. Color and depth are then corrected as if the camera had
+    recorded all rows at one instant. This correction needs the motion of the camera, and is skipped
+    for a frame whose motion is unknown.
     """
 
     depth_bias: Terms = NO_TERMS  # b1, b2, b3 in 1/m.
@@ -66,13 +68,13 @@ class CameraCorrection(msgspec.Struct, frozen=True, kw_only=True):
 class Keyframe(Message, frozen=True, kw_only=True):
     """Frame to be mapped, with its pose relative to a reference keyframe.
 
-    Published on keyframe/new. The message has no pose in the map, because the pose-graph optimizer
-    changes the poses in the map. A receiver computes T_map_keyframe = T_map_reference @
-    T_reference_keyframe. If the receiver missed the reference, it computes T_map_keyframe from
+    The message is published on keyframe/new. It has no pose in the map, because the pose-graph
+    optimizer changes the poses in the map. A receiver computes T_map_keyframe = T_map_reference @
+    T_reference_keyframe. A receiver that missed the reference keyframe computes T_map_keyframe from
     T_odom_keyframe and any other keyframe of the submap.
 
-    The first keyframe of a submap has no reference: tracking started with it or was lost before it,
-    so its pose in other submaps is unknown.
+    The first keyframe of a submap has no reference keyframe. Tracking started with this first
+    keyframe or was lost before it, so its pose in other submaps is unknown.
     """
 
     keyframe: int  # Id, ascending.
@@ -140,7 +142,7 @@ def _check_measurements(message: Keyframe | KeyframeMeasurements) -> None:
     if any(pose.keyframe != keyframe for pose in message.submap_measurements):
         raise ValueError(
             f"submap_measurements of keyframe {keyframe} contain the pose of another keyframe; all "
-            "must be poses of this keyframe"
+            f"must be poses of keyframe {keyframe}"
         )
     if message.reference is not None and not 0 <= message.reference < keyframe:
         raise ValueError(

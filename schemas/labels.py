@@ -78,9 +78,9 @@ class LabelResult(Message, frozen=True, kw_only=True):
 
 
 class AddLabel(Message, frozen=True, kw_only=True):
-    """Request to add a name to the list that the labeller chooses from, published on label/add.
+    """Request, published on label/add, to add a name to the names that the labeller chooses from.
 
-    stamp_ns identifies the request; the reply has the same stamp.
+    stamp_ns identifies the request. The reply on label/names has the same stamp.
     """
 
     name: str  # Name to add, 1 to 100 characters.
@@ -88,8 +88,8 @@ class AddLabel(Message, frozen=True, kw_only=True):
     def check(self) -> None:
         if not 0 < len(self.name.strip()) <= MAX_LABEL_LENGTH:
             raise ValueError(
-                f"name has {len(self.name)} characters, must have 1 to {MAX_LABEL_LENGTH} without "
-                "spaces at its ends"
+                f"name has {len(self.name)} characters, must have 1 to {MAX_LABEL_LENGTH}, not "
+                "counting spaces at its ends"
             )
 
 

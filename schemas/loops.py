@@ -1,4 +1,4 @@
-"""Loop closures and loop candidates: keyframes that show the same surfaces at different times."""
+"""Loop closures, and loop candidates with the result of their verification."""
 
 from typing import Literal
 
@@ -11,7 +11,7 @@ MAX_REASON_LENGTH = 100  # Characters.
 
 
 class LoopClosure(Message, frozen=True, kw_only=True):
-    """Verified pose between an old and a new keyframe, published on loop/closure.
+    """Verified relative pose of an old and a new keyframe, published on loop/closure.
 
     stamp_ns is the stamp of the new keyframe. The pose-graph optimizer accepts the closure only if
     the closure agrees with the other factors of the pose graph.

@@ -36,10 +36,11 @@ class Gaussians(msgspec.Struct, frozen=True, kw_only=True):
     byte  26      number of keyframes since then that show the Gaussian in no object (u1)
     bytes 27..31  labels of the five weights, indices into `label_names` (u1)
 
-    The five weights are probabilities, whose sum is at most 1. The difference from 1 is the weight
-    of background, which is label 0. If the first weight is larger than that of background, the
-    likeliest label is byte 27; otherwise it is 0. The size of an object is the side of the square
-    that has the area of its 2D box, at the depth of the Gaussian.
+    The five weights of labels are probabilities, whose sum is at most 1. The difference from 1 is
+    the weight of background, which is label 0. The likeliest label is the value of byte 27 if the
+    first weight is larger than that of background. Otherwise, the likeliest label is 0. The size of
+    an object is the side, at the depth of the Gaussian, of a square with the area of the object's
+    2D box.
     """
 
     ids: Array  # Ids, i8 [N], unique, ascending.
@@ -59,7 +60,7 @@ class Gaussians(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class AnchorMotion(msgspec.Struct, frozen=True, kw_only=True):
-    """Rigid motion of the means and rotations of all Gaussians with the anchor `keyframe`."""
+    """Rigid motion of the means and rotations of all Gaussians whose anchor is `keyframe`."""
 
     keyframe: int
     T_new_old: Pose  # Transform in the map frame: mean_new = T_new_old mean_old.
@@ -69,7 +70,7 @@ class AnchorMotion(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MapDelta(Message, frozen=True, kw_only=True):
-    """Changes from version `base_version` of the map to `version`, published on map/delta."""
+    """Changes of the map from version `base_version` to `version`, published on map/delta."""
 
     base_version: int
     version: int
@@ -100,9 +101,10 @@ NO_EXPOSURES = Array.of(np.zeros((0, 2, 3), np.float32))
 class MapSnapshot(Message, frozen=True, kw_only=True):
     """One of several messages that together contain the whole map at `version`.
 
-    The messages are published on map/snapshot and numbered by `part`, from 0 to parts - 1. Part 0
-    also has the exposure of each keyframe and the names of the labels. A map color in 0..1 appears
-    in the image of a keyframe as gain * color + bias, per channel.
+    The messages are published on map/snapshot and numbered by `part`, from 0 to `parts` - 1. Part 0
+    also has the exposure of each keyframe and the names of the labels. The exposure is a gain and a
+    bias per channel. A color of the map, in 0..1, appears in the image of a keyframe as
+    gain * color + bias.
     """
 
     version: int
@@ -182,7 +184,7 @@ MAX_NAMES = 256  # Number of values of one byte.
 
 
 def require_names(names: tuple[str, ...]) -> None:
-    """Raise ValueError if there are too many label names or one is too long."""
+    """Raise ValueError if there are too many label names or a name is too long."""
     if len(names) > MAX_NAMES:
         raise ValueError(f"{len(names)} label_names are too many, at most {MAX_NAMES} are allowed")
     longest = max(map(len, names), default=0)
@@ -193,7 +195,7 @@ def require_names(names: tuple[str, ...]) -> None:
 
 
 def require_weights(labels: Array) -> None:
-    """Raise ValueError unless the weights (bytes 0..23 of each row) are finite and at least 0."""
+    """Raise ValueError if a weight of `labels` (bytes 0..23 of a row) is negative or not finite."""
     numbers = np.ascontiguousarray(labels.numpy()[:, :24]).view("<f4")
     if not (np.isfinite(numbers).all() and (numbers >= 0).all()):
         raise ValueError(
@@ -203,6 +205,6 @@ def require_weights(labels: Array) -> None:
 
 
 def require_version(version: int, graph_version: int) -> None:
-    """Raise ValueError unless both versions are valid counters."""
+    """Raise ValueError unless both versions are at least 0 and fit in an int64."""
     require_count("version", version)
     require_count("graph_version", graph_version)

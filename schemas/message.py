@@ -1,9 +1,9 @@
 """Base class of every message, and the checks that msgspec does not make.
 
-msgspec checks types while it decodes, but it accepts NaN, and it does not compare the size of a
-buffer with its shape. The checks of this package run in `__post_init__`, so every message object is
-valid, whether it was built or received. A failed check raises ValueError when a message is built,
-and msgspec.ValidationError when a message is decoded.
+msgspec checks types while it decodes. It accepts NaN, however, and does not check that the data of
+an array have the size that its shape requires. The checks of this package run in `__post_init__`,
+so every message object is valid, whether it was built or received. A failed check raises ValueError
+when a message is built, and msgspec.ValidationError when a message is decoded.
 """
 
 from collections.abc import Iterable
@@ -46,7 +46,7 @@ def decode(body: bytes | memoryview, kind: type[T]) -> T:
     except msgspec.DecodeError:
         raise
     except (RecursionError, ValueError) as error:  # Nested too deeply, or text that is not UTF-8.
-        raise msgspec.DecodeError(f"cannot be decoded: {error}") from None
+        raise msgspec.DecodeError(f"the message cannot be decoded: {error}") from None
 
 
 def encode(message: Message) -> bytes:

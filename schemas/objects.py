@@ -44,7 +44,7 @@ class ObjectObservation(Message, frozen=True, kw_only=True):
 
 
 class ObjectView(msgspec.Struct, frozen=True, kw_only=True):
-    """Keyframe that shows much of an object, and the box of the object in its image."""
+    """Keyframe that shows much of an object, with the object's box in the keyframe's image."""
 
     keyframe: int
     box_px: Box
@@ -88,7 +88,8 @@ class MapObject(msgspec.Struct, frozen=True, kw_only=True):
             raise ValueError(f"confidence is {self.confidence:g}, must be within 0..1")
         if len(self.covariance) != 9 or min(self.covariance[::4]) < 0:
             raise ValueError(
-                f"covariance is {self.covariance}, must be 9 numbers with variances of at least 0"
+                f"covariance is {self.covariance}, must be 9 numbers; those on the diagonal must "
+                "be at least 0"
             )
         if min(self.size) < 0:
             raise ValueError(f"size is {self.size}, must not be negative")
@@ -127,11 +128,14 @@ def require_distribution(distribution: Distribution) -> None:
     if not 0 < len(weights) <= MAX_CLASSES:
         raise ValueError(f"distribution has {len(weights)} classes, must have 1 to {MAX_CLASSES}")
     if len({name for name, _ in distribution}) != len(weights):
-        raise ValueError("a class occurs twice in the distribution")
+        raise ValueError("a class occurs twice in the distribution, must occur once")
     if min(weights) < 0 or sum(weights) > 1 + ROUNDING:
         raise ValueError(f"probabilities are {weights}, must not be negative or sum to more than 1")
     if any(not 0 < len(name) <= MAX_LABEL_LENGTH for name, _ in distribution):
-        raise ValueError(f"names of classes must have 1 to {MAX_LABEL_LENGTH} characters")
+        raise ValueError(
+            "a class name in the distribution is empty or too long, must have 1 to "
+            f"{MAX_LABEL_LENGTH} characters"
+        )
 
 
 def require_entropy(entropy: float) -> None:

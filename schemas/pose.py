@@ -37,8 +37,8 @@ class Pose(msgspec.Struct, frozen=True):
     def matrix(self) -> np.ndarray:
         """Return the transform as a homogeneous matrix, [4, 4] float64.
 
-        Matrices can be multiplied and inverted: `T_map_odom.matrix() @ T_odom_camera.matrix()` is
-        T_map_camera.
+        The product of two matrices chains the transforms: `T_map_odom.matrix() @
+        T_odom_camera.matrix()` is the matrix of T_map_camera.
         """
         w, *v = self.quaternion
         x, y, z = v
@@ -67,8 +67,8 @@ def require_matrix6(name: str, values: Matrix6) -> None:
 class TrackedPose(Message, frozen=True, kw_only=True):
     """Camera pose at `stamp_ns`, published on pose/tracked (REP-105 frames).
 
-    WEAK: the pose is uncertain, and the frame is not mapped. LOST: the pose of the frame is
-    unknown; the message repeats the last pose that was OK.
+    The status WEAK means that the pose is uncertain, and that the frame is not mapped. LOST means
+    that the pose of the frame is unknown. The message then repeats the last pose with status OK.
     """
 
     frame: int  # Frame number, as in camera/rgbd.

@@ -39,7 +39,7 @@ class Topic:
 
     @property
     def subscription_key(self) -> str:
-        """Name to subscribe to for all messages of the topic; it may contain a wildcard."""
+        """Key expression, without `ldo/<robot>/`, that matches all messages of the topic."""
         return f"{self.name}/*" if self.is_per_actor else self.name
 
     def expression(self, robot: str) -> str:

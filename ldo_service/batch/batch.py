@@ -1,4 +1,4 @@
-"""Batch of recordings: a job for each one without results, and the outcome of every recording."""
+"""Batch of recordings: a job for each recording without results, and all outcomes."""
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -27,10 +27,10 @@ class Batch:
     """Options of a batch.
 
     Attributes:
-        plan: Work on each recording.
+        plan: Settings of the work on each recording.
         out: Folder with all results.
-        staging: Folder for recordings and results of running processes.
-        max_staged_bytes: Limit of all staged recordings on one machine.
+        staging: Temporary folder for copies of recordings and for unfinished results.
+        max_staged_bytes: Maximum total size of the copies of recordings on one machine, bytes.
     """
 
     plan: RunPlan
@@ -90,8 +90,8 @@ class Batch:
     def job(self, recording: Recording) -> BatchJob:
         """Return the job of a recording.
 
-        The folder of its results is named after the recording and the first `KEY_DIGITS` digits of
-        `key_of`, the digest of everything that the results depend on.
+        The folder of the results is named after the recording and the first `KEY_DIGITS` digits of
+        a digest. `key_of` computes this digest of everything that the results depend on.
         """
         key = key_of(recording, self.plan)
         return BatchJob(
@@ -112,11 +112,11 @@ def _duplicate(source: str, other: str) -> Outcome:
 
 
 def default_workers(threads: int, memory_gb: float) -> int:
-    """Return the number of recordings that fit on this machine at the same time.
+    """Return the number of recordings that this machine can process at the same time.
 
     Args:
         threads: Threads for each recording; 0 for all cores.
-        memory_gb: Memory for each recording.
+        memory_gb: Memory for each recording, GB; 0 for no limit by memory.
     """
     cores = len(os.sched_getaffinity(0))
     memory_bytes = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

@@ -24,7 +24,7 @@ class Executor(Protocol):
     """Interface of the executors of batch jobs."""
 
     def outcomes(self, jobs: Iterable[BatchJob]) -> Generator[Outcome, None, None]:
-        """Yield the outcome of each job, in the order in which they finish.
+        """Yield the outcome of each job, in the order in which the jobs finish.
 
         Closing the iterator ends all running jobs, for example after a KeyboardInterrupt in the
         caller.

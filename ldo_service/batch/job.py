@@ -29,13 +29,13 @@ class RunPlan(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         config: Configuration of the runs.
-        stride: Every N-th frame is used.
+        stride: N, where every N-th frame is used.
         max_frames: Maximum number of frames; None for all.
-        refine: Iterations of the Gaussian optimizer after the last frame.
+        refine: Number of iterations of the Gaussian optimizer after the last frame.
         exports: Formats of `ldo export`.
         threads: Threads of one process; 0 for all cores.
-        evaluates_all: True to evaluate the renderings of every recording in full. False to render
-            only a few frames of a recording that has no ground truth.
+        evaluates_all: True to evaluate the renderings of every recording in full. False to limit
+            recordings without ground truth to a few rendered frames.
 
     Raises:
         ConfigError: An option is out of its range, or two options exclude each other.
@@ -51,9 +51,13 @@ class RunPlan(msgspec.Struct, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         if self.threads < 0:
-            raise ConfigError(f"--threads {self.threads} must not be negative.")
+            raise ConfigError(
+                f"--threads {self.threads} must not be negative. Use 0 for all cores."
+            )
         if self.refine < 0:
-            raise ConfigError(f"--refine-iterations {self.refine} must not be negative.")
+            raise ConfigError(
+                f"--refine-iterations {self.refine} must not be negative. Use 0 for no refinement."
+            )
         Selection(self.stride, self.max_frames)
         require_held_out(self.stride, self.config.tracker.hold_out)
 
@@ -63,15 +67,15 @@ class BatchJob(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         recording: The recording.
-        plan: The work.
+        plan: Settings of the work.
         out: Path or address of the folder with all results.
         folder: Folder of this result, relative to `out`.
         key: Digest of the content of the source and of everything that the results depend on.
         keeps_front_end: True to record the outputs of the tracker and the detector.
         front_end: Folder of an earlier run, relative to `out`. Its recorded outputs replace frame
             source, tracker and detector. Empty to run these actors.
-        staging: Folder for recordings and results of running processes.
-        max_staged_bytes: Limit of all staged recordings on one machine.
+        staging: Temporary folder for copies of recordings and for unfinished results.
+        max_staged_bytes: Maximum total size of the copies of recordings on one machine, bytes.
         repeats: True to replace finished results.
         version: Version of LDO-SLAM that must process the recording.
     """
@@ -90,7 +94,7 @@ class BatchJob(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Costs(msgspec.Struct, frozen=True, kw_only=True):
-    """Resources that a job used: the process that ran and evaluated one recording."""
+    """Resources that the process of one job used to run and evaluate its recording."""
 
     wall_s: float  # Wall time until the results are published.
     cpu_s: float  # CPU time of all threads of the process, including its start.
@@ -104,15 +108,17 @@ class Costs(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):
-    """Outcome of a recording.
+    """Outcome of one recording of a batch.
 
     Attributes:
         source: Path or address of the recording.
         name: Name of the recording.
         folder: Folder of the result, relative to the folder of all results.
-        status: "done" in this call, "kept" from an earlier call, "failed", or "missing" if the
-            batch was interrupted.
-        error: Reason of the failure on one line; empty if the recording did not fail.
+        status: "done" if this call made the results, and "kept" if an earlier call made them.
+            "failed" if the recording could not be read or processed, and "missing" if the batch was
+            interrupted before.
+            "duplicate" if another source has the same name and content.
+        error: Reason why there are no results, on one line; empty if there are results.
         notes: Warnings of the run and of its evaluation.
         digest: Digest of all results that do not depend on timing; see `results.digest_of`.
         summary: Counts and scores for the table.
@@ -141,8 +147,8 @@ def failed(job: BatchJob, error: str, status: str = "failed") -> Outcome:
     """Return the outcome of a recording without results.
 
     Args:
-        job: The recording.
-        error: The reason; it is shortened to one line.
+        job: Job of the recording.
+        error: Reason why there are no results. Its line breaks are replaced by spaces.
         status: "failed" or "missing".
     """
     return Outcome(
@@ -157,13 +163,13 @@ def failed(job: BatchJob, error: str, status: str = "failed") -> Outcome:
 def key_of(recording: Recording, plan: RunPlan, **others: Any) -> str:
     """Return a hexadecimal digest of everything that the results of a recording depend on.
 
-    It covers the content of the recording, the configuration with the networks, the options of the
-    plan except its number of threads, and the version of LDO-SLAM. The path of the recording is not
-    part of it.
+    The digest covers the content of the recording, the configuration, the files of the networks,
+    the options of the plan except its number of threads, and the version of LDO-SLAM. It does not
+    cover the path of the recording.
 
     Args:
         recording: The recording.
-        plan: The work.
+        plan: Settings of the work.
         others: Further values that the results depend on.
     """
     config = plan.config

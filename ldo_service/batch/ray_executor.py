@@ -33,8 +33,9 @@ class RayNeeds:
 class RayExecutor:
     """Executor on a Ray cluster.
 
-    Ray starts a task on a host that has the needed resources free. If its process or its host is
-    lost, Ray starts the task again on another host. A worker process ends after each recording.
+    Ray starts a task on a host where the needed resources are free. If the process or the host of
+    the task is lost, Ray starts the task again on another host. A worker process ends after each
+    recording.
 
     Attributes:
         address: Address of the cluster, such as `auto` or HOST:6379.
@@ -42,7 +43,7 @@ class RayExecutor:
         workers: Maximum number of recordings at the same time; None for as many as fit.
 
     Raises:
-        ConfigError: Ray is not installed, which is found before recordings are looked up.
+        ConfigError: Ray is not installed.
     """
 
     address: str
@@ -104,10 +105,11 @@ class RayExecutor:
             return
         largest = {name: max((host.get(name, 0) for host in hosts), default=0) for name in wanted}
         raise ConfigError(
-            f"no host of {self.address} has {self.needs.cpus} CPUs, {self.needs.memory_gb:g} GB of "
-            f"memory and {self.needs.gpus:g} GPUs for a recording. The largest values of a host "
-            f"are {largest['CPU']:g} CPUs, {largest['memory'] / GB:.1f} GB and "
-            f"{largest['GPU']:g} GPUs. Lower --threads, --memory-gb or --gpus."
+            f"no host of the Ray cluster {self.address} has {self.needs.cpus} CPUs, "
+            f"{self.needs.memory_gb:g} GB of memory and {self.needs.gpus:g} GPUs, which a "
+            f"recording needs. The largest values on any host are {largest['CPU']:g} CPUs, "
+            f"{largest['memory'] / GB:.1f} GB and {largest['GPU']:g} GPUs. Lower --threads, "
+            "--memory-gb or --gpus."
         )
 
 

@@ -36,7 +36,7 @@ code { font-size: .9em; background: #8882; padding: 0 .25em; }
 
 
 class Report(msgspec.Struct, frozen=True, kw_only=True):
-    """Content of batch.json: totals, and the outcome of each recording in the given order."""
+    """Content of batch.json: the totals of a batch, and the outcome of each recording."""
 
     ldo: str  # Version of LDO-SLAM.
     finished: str  # Time, ISO 8601.
@@ -72,7 +72,7 @@ def report_of(outcomes: Sequence[Outcome], wall_s: float, *, is_interrupted: boo
 
 
 def save_report(out: Store, report: Report) -> None:
-    """Write batch.json and the page.
+    """Write a report to a folder, as batch.json and as the HTML page index.html.
 
     Raises:
         DataError: The folder cannot be written.
@@ -82,7 +82,7 @@ def save_report(out: Store, report: Report) -> None:
 
 
 def cells(outcome: Outcome) -> list[str]:
-    """Return the texts of a row of the table, one for each of COLUMNS."""
+    """Return the texts of the table row of a recording, one for each of COLUMNS."""
     summary, costs = outcome.summary, outcome.costs
     if not outcome.has_results:
         return [outcome.name, outcome.status, *("" for _ in COLUMNS[2:])]

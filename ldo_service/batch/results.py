@@ -1,7 +1,8 @@
 """Folders with the results of a batch: their publication, and the check whether they are complete.
 
 `result.json` is written last. It lists every other file of the folder with its size and its SHA-256
-checksum. Results without it, or with a missing file or another size, are not finished.
+checksum. Results are not finished if `result.json` or a listed file is missing, or if the size of a
+file differs from the list.
 """
 
 import hashlib
@@ -50,17 +51,18 @@ class ResultFolder:
 
     @staticmethod
     def of(job: BatchJob) -> "ResultFolder":
-        """Return the folder of a job.
+        """Return the folder for the results of a job.
 
         Raises:
-            ConfigError: The protocol of the address is unknown or not installed.
+            ConfigError: The protocol of the folder's address, such as s3, is unknown or not
+                installed.
         """
         return ResultFolder(open_store(job.out).at(job.folder), job.key)
 
     def finished(self) -> Outcome | None:
-        """Return the outcome of the results in the folder; None unless they are finished.
+        """Return the outcome of the results in the folder, or None if they are not finished.
 
-        Finished results are complete and have the key of the job.
+        Finished results are complete, and were made with the same key as this folder has.
 
         Raises:
             DataError: The folder cannot be read.
@@ -77,17 +79,18 @@ class ResultFolder:
         return msgspec.structs.replace(result.outcome, status="kept")
 
     def publish(self, made: Path, outcome: Outcome) -> Outcome:
-        """Replace the folder by a local folder with results.
+        """Replace the content of this folder by the results in a local folder.
 
         Args:
-            made: The local folder, which is moved if the results are on the same disk.
+            made: Local folder with the results. It is uploaded if this folder is in a bucket, and
+                moved otherwise.
             outcome: Outcome of the recording, without the digest and the size of the results.
 
         Returns:
             The outcome with the digest and the size of the results.
 
         Raises:
-            DataError: The folder cannot be written, or holds files that no batch wrote.
+            DataError: This folder cannot be written, or holds files that no batch wrote.
         """
         files = _files(made)
         size_bytes = sum(file.size_bytes for file in files.values())

@@ -1,8 +1,8 @@
 """Recordings of a batch: found from paths, patterns, lists and buckets, with a content digest.
 
 A source is the path of a recording, its address in a bucket, or `synthetic:NAME`. A folder that is
-no recording stands for the recordings directly in it. A pattern such as `s3://bucket/night/*`
-stands for the recordings that it matches.
+not a recording itself stands for the recordings directly in it. A pattern such as
+`s3://bucket/night/*` stands for the recordings that it matches.
 """
 
 import hashlib
@@ -44,20 +44,21 @@ class Recording:
 def find_recordings(
     words: Iterable[str], note: Callable[[str], None]
 ) -> dict[str, LdoError | None]:
-    """Find the recordings that arguments of the command line name.
+    """Find the recordings that the arguments of a command stand for.
 
     Args:
         words: The arguments: paths, addresses, patterns and `synthetic:NAME`.
-        note: Function that receives a sentence about entries that are not used.
+        note: Function that is called with a sentence about arguments or entries that are not used.
 
     Returns:
-        A dictionary in the order of the arguments, with each recording once. The path or address of
-        a recording has the value None. An argument that names no recording has its error as value:
-        a path that does not exist, a pattern without matches, a folder without recordings, or an
-        address whose protocol is not installed.
+        A dictionary in the order of the arguments, with each recording once. A found recording is
+        a key with the value None; the key is its path, its address or `synthetic:NAME`. An argument
+        without a recording is a key whose value is the error. Such an argument is a path that does
+        not exist, a pattern without matches, a folder without recordings, or an address whose
+        protocol is not installed.
 
     Raises:
-        LdoError: No argument names a recording. The error is that of the first argument.
+        LdoError: No argument stands for a recording. The error is that of the first argument.
     """
     found = dict[str, LdoError | None]()
     for word in words:
@@ -80,7 +81,7 @@ def find_recordings(
 def listed(path: Path) -> list[str]:
     """Return the lines of a file of sources, without empty lines and comments (#).
 
-    Relative paths are relative to the folder of the file.
+    The folder of the file is put before each relative path.
 
     Raises:
         ConfigError: The file cannot be read.

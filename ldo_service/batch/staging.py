@@ -1,7 +1,8 @@
-"""Local folders of running processes, with a limit on the recordings that they copy.
+"""Local folders of running processes, with a limit on the size of the recordings in them.
 
-Each process has a folder `job-*` and holds a lock on its file `lock`. The kernel releases the lock
-when the process ends, however it ends. The next process removes folders without a lock.
+Each process has a folder `job-*` and holds a lock on the file `lock` in this folder. The kernel
+releases the lock when the process ends, even by a crash. The next process that starts removes each
+folder whose lock is released.
 """
 
 import fcntl
@@ -24,12 +25,13 @@ GB = 10**9
 def staging_folder(root: Path, size_bytes: int, max_bytes: int) -> Iterator[Path]:
     """Yield an empty folder, and remove it at the end of the context.
 
-    The function waits until the new recording and those of other processes are within the limit.
+    The function first waits until the new recording fits: the recordings of all processes, together
+    with the new one, must not exceed the limit.
 
     Args:
-        root: Folder for the folders of all processes of this machine.
+        root: Parent of the folders of all processes of this machine.
         size_bytes: Size of the recording that will be copied into the folder; 0 for none.
-        max_bytes: Limit of the recordings of all processes.
+        max_bytes: Maximum total size of the recordings of all processes.
 
     Raises:
         DataError: The recording alone exceeds the limit, or the folder cannot be created.

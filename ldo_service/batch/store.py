@@ -85,7 +85,7 @@ class Store:
             return self.system.isfile(self.path)
 
     def matches(self) -> list["Entry"]:
-        """Return the files and folders that match the path as a pattern, sorted."""
+        """Return all files and folders that match this path, which is a pattern; sorted."""
         with self._reported("read"):
             found = self.system.glob(self.path, detail=True)
         return self._entries(found.values())
@@ -126,7 +126,7 @@ class Store:
             raise _as_data_error(self.url, "read", error) from error
 
     def write(self, content: bytes) -> None:
-        """Write or replace the file; a reader sees the old or the new content."""
+        """Write or replace the file; a reader sees the whole old or the whole new content."""
         with self._reported("written"):
             if self.is_local:
                 self.local.parent.mkdir(parents=True, exist_ok=True)
@@ -177,7 +177,7 @@ class Entry:
 def open_store(url: str) -> Store:
     """Open a folder or a file by its path or its address PROTOCOL://PATH.
 
-    Nothing is read or created.
+    The function reads and creates no file.
 
     Raises:
         ConfigError: The protocol is unknown, or a package that it needs is not installed.

@@ -1,4 +1,4 @@
-"""Processing of one recording of a batch, from its copy to the published results."""
+"""Processing of one recording of a batch: copying, SLAM, evaluation, export and publication."""
 
 import json
 import logging
@@ -52,12 +52,12 @@ class _Notes(logging.Handler):
         self.found: list[str] = []
 
     def add(self, text: str) -> None:
-        """Keep a warning, unless there are too many."""
+        """Keep a warning, unless MAX_NOTES warnings are kept already."""
         if len(self.found) < MAX_NOTES:
             self.found.append(" ".join(str(text).split()))
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Keep a warning of the log."""
+        """Keep the message of a warning that was logged."""
         self.add(record.getMessage())
 
 
@@ -210,9 +210,9 @@ def _evaluate(
 
 
 def sample(frames: Iterable[RunFrame], count: int) -> EvaluatedFrames:
-    """Select at most `count` frames with a pose at even intervals.
+    """Select at most `count` frames at even intervals from the frames that have a pose.
 
-    Held-out frames are selected if there are any, otherwise training frames.
+    Only held-out frames are selected if there are any; otherwise, training frames are selected.
     """
     whole = EvaluatedFrames.of(frames)
     held_out = tuple(frame for frame in whole.held_out if not frame.is_lost)

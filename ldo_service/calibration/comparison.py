@@ -1,9 +1,10 @@
 """Comparison of two calibration views: depth, features and colors as linearized equations.
 
-The equations of depth and features have two kinds of unknowns. All pairs share the coefficients of
-the depth bias (columns `BIAS`) and the times of the shutter (columns `TIMES`). Each pair has a
-relative pose of its own. Points move with the velocity of the camera between the
-times at which the rows of color and depth are recorded. Conventions: `ldo_service.geometry`.
+The equations of depth and features have two kinds of unknowns. All pairs of views share the
+coefficients of the depth bias (columns `BIAS`) and the times of the shutter (columns `TIMES`). Each
+pair has a relative pose of its own. The camera records the rows of color and depth at different
+times. The equations move the points between these times with the velocity of the camera.
+Conventions: `ldo_service.geometry`.
 """
 
 from dataclasses import dataclass
@@ -55,7 +56,8 @@ COLUMNS = TIMES.stop + 7  # Shared unknowns, relative pose and residual.
 class CommonPoints:
     """Surface points that both views of a pair show.
 
-    A point is given by its block in each view. The blocks of a view are numbered row by row.
+    A point is given by the block of pixels that shows it in each view. The blocks of a view are
+    numbered row by row.
     """
 
     in_first: np.ndarray  # [N] int64, blocks of the first view.
@@ -64,7 +66,7 @@ class CommonPoints:
 
 @dataclass(frozen=True, slots=True)
 class ComparedPair:
-    """Pair of views with the shared coefficients at which it is linearized."""
+    """Pair of views, and the shared unknowns at which its equations are linearized."""
 
     first: CalibrationView  # View `pair.first`, whose depth is used.
     second: CalibrationView  # View `pair.second`.
@@ -76,9 +78,10 @@ class ComparedPair:
 
 @lru_cache(maxsize=2)
 def block_grid(camera: Camera, block: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return values at the centers of the h x w blocks of a view, three arrays [h w, 3].
+    """Return rays and basis functions at the centers of the h x w blocks of a view.
 
-    The arrays are the rays, and the basis functions of the depth bias and of the vignetting.
+    The result has three arrays [h w, 3]: the viewing rays, the values of the three basis functions
+    of the depth bias, and those of the three basis functions of the vignetting.
     """
     u, v = block_centers(camera, block)
     bases = bias_basis(u, v, camera), vignetting_basis(u, v, camera)
@@ -87,14 +90,15 @@ def block_grid(camera: Camera, block: int) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def view_surface(view: CalibrationView, coefficients: np.ndarray) -> np.ndarray:
-    """Return a surface point and a unit normal for each block of a view, [h w, 6].
+    """Return a surface point and a unit normal for each of the h x w blocks of a view, [h w, 6].
 
     Both are in the camera frame, the point in meters. The normal is 0 where the block and its four
     neighbors do not belong to one surface.
 
     Args:
         view: The view.
-        coefficients: Coefficients of the depth bias, which is removed from the depth, [3].
+        coefficients: Coefficients b1, b2, b3 of the depth bias, [3], in 1/m. The bias is removed
+            from the depth.
     """
     rays, basis, _ = block_grid(view.camera, view.block)
     bias = (basis @ coefficients).reshape(view.depth_m.shape)
@@ -109,13 +113,13 @@ def depth_block(
 ) -> tuple[Block, CommonPoints]:
     """Compare the surfaces of both views of a pair.
 
-    A residual is the distance in meters of a point of the first view, moved into the second view,
-    from the tangent plane of the surface there.
+    Each point of the first view is transformed to the second view. Its residual is its distance in
+    meters from the tangent plane of the surface of the second view.
 
     Args:
         compared: The pair.
-        surface_first: Surface of the first view, see `view_surface`, [h w, 6].
-        surface_second: Surface of the second view, [h w, 6].
+        surface_first: Points and normals of the first view, see `view_surface`, [h w, 6].
+        surface_second: Points and normals of the second view, [h w, 6].
 
     Returns:
         The linearized residuals, and the points that both views show.
@@ -156,12 +160,14 @@ def _cells(blocks: np.ndarray, width: int) -> np.ndarray:
 
 
 def feature_block(compared: ComparedPair, surface_first: np.ndarray) -> Block:
-    """Return the linearized reprojection errors of the features in pixels; u and v alternate.
+    """Return the linearized reprojection errors of the features, in pixels.
+
+    Each feature has two successive rows: the error in u, and the error in v.
 
     Args:
         compared: The pair.
-        surface_first: Surface of the first view in its own camera frame, see `view_surface`,
-            [h w, 6].
+        surface_first: Points and normals of the first view, in the frame of its camera, [h w, 6];
+            see `view_surface`.
     """
     view, pair, camera = compared.first, compared.pair, compared.first.camera
     (readout_s, depth_readout_s, delay_s), T = compared.shared[TIMES], pair.T_second_first
@@ -250,9 +256,9 @@ def color_block(
     """Compare the colors of two views at their common points.
 
     Returns:
-        The measurements of the three channels, whose weights are 1. The pair's own unknowns are
-        gain and offset of the exposure.
-        None if there are fewer than MIN_COMMON points.
+        The linearized measurements of the three color channels, all with weight 1. The pair's own
+        unknowns in each channel are gain and offset of the exposure.
+        None if fewer than MIN_COMMON points are compared.
     """
     is_exposed = first.is_exposed.reshape(-1)[points.in_first]
     is_exposed &= second.is_exposed.reshape(-1)[points.in_second]

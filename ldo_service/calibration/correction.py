@@ -1,4 +1,4 @@
-"""Correction of a frame for vignetting and depth bias, with the timing of the shutter."""
+"""Correction of vignetting and depth bias in frames."""
 
 import json
 from bisect import bisect_right
@@ -33,15 +33,16 @@ MIN_TRANSMISSION = 0.3  # Darker corners would be amplified together with their 
 class CameraCorrection:
     """Vignetting and depth bias of a camera, in its rectified image.
 
-    With x = (u - cu) / (w/2) and y = (v - cv) / (w/2) around the image center, and the distance r
-    from the center, scaled to 1 in the corners:
+    A pixel (u, v) has the coordinates x = (u - cu) / (w/2) and y = (v - cv) / (w/2) around the
+    center (cu, cv) of an image of width w. Its distance r from the center is scaled to 1 in the
+    corners. The errors of the camera are:
 
         1 / z_true = 1 / z_measured + b1 x^2 + b2 x y + b3 y^2
         color_measured = V(r) color_true,  log V = a1 r^2 + a2 r^4 + a3 r^6 per channel
 
     The bias has no constant term and no linear terms. Such terms would scale and tilt the depth.
-    Changed poses would have nearly the same effect on the measurements, so the two could hardly be
-    separated.
+    They could hardly be estimated, because changed poses have nearly the same effect on the
+    measurements.
     """
 
     depth_bias: tuple[float, ...] = (0.0,) * BIAS_TERMS  # b1, b2, b3 in 1/m.
@@ -53,9 +54,9 @@ class CameraCorrection:
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> "CameraCorrection":
-        """Restore a correction from a mapping of field names to values; tuples may be lists.
+        """Restore a correction from a mapping of names to values, as `pack` returns it.
 
-        `pack` returns such a mapping.
+        The values may be lists or tuples of numbers.
         """
         return CameraCorrection(
             tuple(values["depth_bias"]),
@@ -64,7 +65,7 @@ class CameraCorrection:
         )
 
     def pack(self) -> dict[str, Any]:
-        """Return the fields by name, as lists of plain values."""
+        """Return a dictionary from the name of each value to a number or a list of numbers."""
         return {
             "depth_bias": list(self.depth_bias),
             "vignetting": [list(channel) for channel in self.vignetting],
@@ -89,9 +90,9 @@ class CameraCorrection:
 
         Args:
             frame: Rectified frame, which is not changed.
-            keeps_clipped: True does not change pixels that may be clipped, so that the tracker
-                still recognizes them as clipped. False corrects them too, so that they match their
-                surroundings in the map.
+            keeps_clipped: True to leave the colors of pixels that may be clipped unchanged, so that
+                the tracker still recognizes these pixels as clipped. False to correct them too, so
+                that they match their surroundings in the map.
         """
         color, depth_m = frame.color, self.corrected_depth(frame.depth_m, frame.camera)
         if self.has_vignetting:
@@ -124,9 +125,9 @@ class CorrectionHistory:
     corrections: tuple[CameraCorrection, ...] = ()  # Corrections, one per keyframe.
 
     def at(self, stamp_ns: int) -> CameraCorrection:
-        """Return the correction of the last keyframe up to a stamp.
+        """Return the correction of the last keyframe whose stamp is at most `stamp_ns`.
 
-        Before the first keyframe, the result is a correction that changes nothing.
+        If there is no such keyframe, the result is a correction that changes nothing.
         """
         count = bisect_right(self.stamps_ns, stamp_ns)
         return self.corrections[count - 1] if count else CameraCorrection()
@@ -140,7 +141,8 @@ class CorrectionHistory:
 def read_corrections(folder: Path) -> CorrectionHistory:
     """Return the camera correction with which each keyframe of a finished run was made.
 
-    A keyframe from an older version has no correction and counts as not corrected.
+    A keyframe that an older version of LDO-SLAM wrote has no correction. It gets a correction that
+    changes nothing.
 
     Raises:
         DataError: keyframes.json of the folder cannot be read, or its content is invalid.
@@ -178,13 +180,13 @@ class CorrectionChange:
 
     @staticmethod
     def of(values: Mapping[str, Any]) -> "CorrectionChange":
-        """Restore a change from its fields by name."""
+        """Restore a change from a mapping of names to values, as `pack` returns it."""
         return CorrectionChange(
             CameraCorrection.of(values["old"]), CameraCorrection.of(values["new"])
         )
 
     def pack(self) -> dict[str, Any]:
-        """Return the fields by name, as lists of plain values."""
+        """Return both corrections by name, each as `CameraCorrection.pack` returns it."""
         return {"old": self.old.pack(), "new": self.new.pack()}
 
     def after(self, earlier: "CorrectionChange | None") -> "CorrectionChange":
@@ -200,7 +202,8 @@ class CorrectionChange:
     def gray(self, gray: np.ndarray, camera: Camera) -> np.ndarray:
         """Convert a gray image [H, W] uint8 from the old correction to the new one.
 
-        Pixels that may be clipped do not change, nor do black pixels, which are invalid.
+        Two kinds of pixels do not change: pixels that may be clipped, and black pixels, which are
+        invalid.
         """
         if self.old.vignetting == self.new.vignetting:
             return gray
@@ -237,13 +240,13 @@ def unbiased_depth(depth_m: np.ndarray, bias: np.ndarray) -> np.ndarray:
 
 
 def bias_basis(u: np.ndarray, v: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return the basis functions of the depth bias at pixels [...], as [..., 3]."""
+    """Return the basis functions x^2, x y, y^2 of the depth bias at pixels (u, v), [..., 3]."""
     x, y = _centered(u, v, camera)
     return np.stack([x * x, x * y, y * y], axis=-1)
 
 
 def vignetting_basis(u: np.ndarray, v: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return the basis functions of log V at pixels [...], as [..., 3]."""
+    """Return r^2, r^4, r^6 at pixels (u, v), [..., 3]: the basis functions of log vignetting."""
     x, y = _centered(u, v, camera)
     r2 = (x * x + y * y) / (1.0 + (camera.height / camera.width) ** 2)
     return np.stack([r2, r2**2, r2**3], axis=-1)

@@ -4,9 +4,9 @@ A block contains the measurements of one pair of views. Its own unknowns, such a
 of the pair, occur in no other block. All blocks share the coefficients, such as those of the depth
 bias.
 
-Several independent systems are solved at once if the arrays have leading dimensions, written
-[...]. The color channels are such systems: each has its own coefficients and residuals, and all
-have the same pixels.
+Several independent systems of equations are solved at once if the arrays have additional leading
+dimensions, written as "...". The color channels are such systems: each channel has its own
+coefficients and residuals, and all channels have the same pixels.
 """
 
 from collections.abc import Generator, Sequence, Set
@@ -25,14 +25,15 @@ CHECK_WORK = 0.2  # Work of the check of one block, in the unit of `estimation.e
 class Block:
     """Linearized measurements of one pair of views: residual + J_shared dc + J_own dx.
 
-    dc is the step of the K shared coefficients, dx that of the M unknowns of this block. J_shared
-    [..., N, K] and J_own [..., N, M] are the Jacobians of the N residuals for these two.
+    dc is the step of the K shared coefficients. dx is the step of the M unknowns that only this
+    block has. J_shared [..., N, K] is the Jacobian of the N residuals for dc, and J_own [..., N, M]
+    the one for dx.
 
     Attributes:
         rows: J_shared, J_own and the residual side by side, [..., N, K + M + 1].
         weight: Weight of each squared residual, [..., N].
-        cells: Number of the image cell in which each residual lies, [N] int. Cells are squares
-            with an eighth of the image width. Empty for features, which are not checked by cells.
+        cells: Index of the image cell in which each residual lies, [N] int. Cells are squares whose
+            side is an eighth of the image width. Empty for features, which `check` skips.
     """
 
     rows: np.ndarray
@@ -52,8 +53,8 @@ class Block:
 class Reduced:
     """Normal equations of a block after its own unknowns are eliminated (Schur complement).
 
-    The remaining equations are H dc = -g for the step dc of the K shared coefficients. The step of
-    the block's own unknowns follows from it: dx = -own [dc; 1].
+    The remaining equations are H dc = -g for the step dc of the K shared coefficients. The step dx
+    of the M eliminated unknowns follows from dc: dx = -own [dc; 1].
     """
 
     H: np.ndarray  # [..., K, K]
@@ -94,8 +95,9 @@ class Reduced:
 class HeldOutResiduals:
     """Residuals of held-out pairs of views, with and without the estimated coefficients.
 
-    Both values have the unit of the residuals: meters for depth, gray levels for color. They are
-    root mean squares of the mean residuals of image cells, because noise averages out in a cell.
+    Residuals are in meters for depth and in gray levels for color. They are averaged in each cell
+    of the image, so that noise averages out. `rms_without` and `rms_with` are root mean squares of
+    these averages, in the same unit.
     """
 
     rms_without: float  # Value with all shared coefficients at 0.
@@ -103,21 +105,24 @@ class HeldOutResiduals:
 
     @property
     def residual_ratio(self) -> float:
-        """Residual with the estimated coefficients, divided by the residual without them.
+        """Ratio of the residuals with and without the estimated coefficients.
 
-        The ratio is 1 if the residual without them is 0.
+        The ratio is `rms_with / rms_without`, or 1 if `rms_without` is 0.
         """
         return self.rms_with / self.rms_without if self.rms_without > 0 else 1.0
 
 
 def student_weight(residual: np.ndarray, sigma: np.ndarray | float) -> np.ndarray:
-    """Return the weights 1/variance of residuals with a t-distribution (Lange et al., 1989)."""
+    """Return weights of residuals for a t-distribution of scale `sigma` (Lange et al., 1989).
+
+    A weight has the unit of 1 / sigma^2.
+    """
     sigma = np.asarray(sigma)
     return (STUDENT_FREEDOM + 1) / (STUDENT_FREEDOM + (residual / sigma) ** 2) / sigma**2
 
 
 def solve(blocks: Sequence[Reduced], prior: np.ndarray | float, now: np.ndarray) -> np.ndarray:
-    """Minimize sum weight (residual + J_shared dc + J_own dx)^2 + prior (now + dc)^2.
+    """Minimize sum weight (residual + J_shared dc + J_own dx)^2 + prior (now + dc)^2 over dc, dx.
 
     Args:
         blocks: Reduced normal equations.
@@ -139,7 +144,7 @@ def held_out(
 ) -> list[tuple[range, np.ndarray]]:
     """Return groups of successive blocks, each with a step [..., K] of the shared coefficients.
 
-    The step is computed from all blocks outside the group.
+    The step of a group is computed from all blocks that are not in the group.
 
     Args:
         blocks: Reduced normal equations.
@@ -162,14 +167,15 @@ def covariance(
 ) -> np.ndarray:
     """Return the covariance [K, K] of the coefficients.
 
-    It is the sum of two covariances. The first one assumes independent residuals and includes the
-    prior. The second one is that of the jackknife; it covers errors common to many residuals.
+    The result is the sum of two covariances. The first covariance assumes independent residuals and
+    includes the prior. The second covariance is a jackknife estimate, and covers errors that many
+    residuals have in common.
 
     Args:
         blocks: Reduced normal equations.
         prior: Weight of the coefficients: a matrix [K, K], or one weight for all.
         now: Coefficients at which the blocks are linearized, [K].
-        left_out: Groups of indices of blocks; the jackknife leaves out each of them once.
+        left_out: Groups of indices of blocks. The jackknife leaves out each group once.
     """
     H = _weights(prior, now) + sum(block.H for block in blocks)
     steps = np.array(
@@ -192,17 +198,17 @@ def check(
 ) -> Generator[float, None, list[HeldOutResiduals]]:
     """Compute the residuals of held-out blocks; yield the amount of work after each block.
 
-    Successive blocks form groups, at most GROUPS in all. Each group is held out once, and the
-    coefficients are estimated from the other blocks.
+    Successive blocks form at most GROUPS groups. Each group is held out once, and the coefficients
+    are estimated from the blocks of the other groups.
 
     Args:
-        blocks: Blocks.
-        reduced: Their reduced normal equations.
+        blocks: All blocks.
+        reduced: Reduced normal equations of each block.
         prior: Weight of the coefficients, the same for all.
         now: Coefficients at which the blocks are linearized, [..., K].
 
     Yields:
-        The work in the unit of `estimation.estimate`, about 1 ms.
+        The work since the last yield. A unit of work takes about 1 ms on one core.
 
     Returns:
         The residuals of each independent system, such as a color channel.

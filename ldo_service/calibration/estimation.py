@@ -1,21 +1,24 @@
 """Estimation of depth bias, shutter timing and vignetting from pairs of views, by least squares.
 
-Depth. The surface points of the first view of a pair, transformed into the second view, must lie on
-the tangent planes of its surface. The unknowns are the bias coefficients, the times of the shutter
-and the relative pose of each pair. The reprojection errors of features constrain the poses too,
-because the image positions of features have no bias.
+Depth: The surface points of the first view of a pair are transformed into the second view. There,
+they must lie on the tangent planes of the second view's surface. The unknowns are the coefficients
+of the depth bias, the three times of `ShutterTiming`, and the relative pose of each pair. The
+reprojection errors of features constrain the poses too, because depth bias does not move features
+in the image.
 
-Times. A row that is recorded at another time than the middle row of color is displaced by the
-velocity of the camera. Bias and times are estimated together: without the times, the distortion by
-a rolling shutter would enter the bias.
+Shutter: The camera moves while a frame is recorded. A row that is recorded earlier or later than
+the middle row of color is therefore displaced. Bias and shutter times are estimated together.
+Otherwise, the distortion by a rolling shutter would be mistaken for depth bias.
 
-Noise. The residual is the difference of two noisy depths. Its derivatives are computed at the mean
-of these depths, because the noise of the mean is independent of that of the difference. Otherwise,
-the noise of a Kinect would shift the y^2 coefficient by up to 0.01/m.
+Noise: The residual is the difference of two noisy depths. Its derivatives are computed at the mean
+of both depths, because the noise of the mean is independent of the noise of the difference. At one
+of the depths, the noise of a Kinect would shift the coefficient of y^2 by up to 0.01/m.
 
-Color. The log ratio of the brightness of one surface point in two views equals the difference of
-log V at its two pixels, apart from a change of the exposure. The gain and the offset of this change
-are unknowns of each pair.
+Color: The two views of a pair show one surface point at two pixels. The log ratio of its brightness
+in both views equals the difference of log V at these pixels. V is the vignetting. A change of the
+exposure between the views adds a gain and an offset, which are unknowns of each pair.
+
+`CameraCorrection` defines depth bias and vignetting.
 """
 
 from collections.abc import Generator, Mapping, Sequence
@@ -77,7 +80,7 @@ SURFACE_WORK, PAIR_WORK, COLOR_PAIR_WORK, COLOR_ROUND_WORK = 0.3, 0.5, 0.3, 0.3
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Result of an estimation: the errors of the camera, and the relative poses of the views."""
+    """Estimated depth bias, shutter times and vignetting, and relative poses of the views."""
 
     depth_bias: np.ndarray  # [3] 1/m, see `CameraCorrection`.
     depth_bias_covariance: np.ndarray  # [3, 3] 1/m^2
@@ -99,12 +102,12 @@ class Estimate:
 
     @property
     def depth_ratio(self) -> float:
-        """Held-out depth residual with the bias removed, divided by the one of the raw depth."""
+        """Held-out depth residual with the bias removed, divided by the residual of raw depth."""
         return self.depth_check.residual_ratio
 
     @property
     def color_ratio(self) -> float:
-        """Held-out color residual with vignetting removed, divided by the one of the raw color."""
+        """Held-out color residual with vignetting removed, divided by the residual of raw color."""
         without = sum(check.rms_without for check in self.color_checks)
         return sum(check.rms_with for check in self.color_checks) / without if without else 1.0
 
@@ -113,18 +116,18 @@ class Estimate:
     ) -> CameraCorrection:
         """Return the correction to use after this estimate.
 
-        Depth bias and vignetting are decided separately, by the residual of held-out pairs of views
-        relative to the residual without correction:
+        Depth bias and vignetting are decided separately. Each has a residual ratio: the residual of
+        held-out pairs of views with the new estimate, divided by the residual without correction.
 
-        - up to the limit in `max_ratios`, the new estimate is used;
-        - up to `MAX_KEPT_RATIO`, a correction in use stays in use: it keeps its value if it comes
-          from an earlier run, and gets the value of the new estimate otherwise;
-        - otherwise, the camera is not corrected: the coefficients are 0.
+        - If the ratio is at most its limit in `max_ratios`, the new estimate is used.
+        - If the ratio is larger, but at most `MAX_KEPT_RATIO`, a correction in `before` stays in
+          use. A correction from an earlier run keeps its value; any other takes the new estimate.
+        - In all other cases, the coefficients are 0: the camera is not corrected.
 
         Args:
-            before: Correction in use.
-            max_ratios: Limits of the depth bias and of the vignetting.
-            is_known: True if the correction in use comes from an earlier run.
+            before: Correction that is in use before this estimate.
+            max_ratios: Maximum residual ratios of the depth bias and of the vignetting.
+            is_known: True if `before` comes from an earlier run.
         """
         depth_bias, vignetting = CameraCorrection().depth_bias, CameraCorrection().vignetting
         new_bias = tuple(self.depth_bias.tolist())
@@ -149,18 +152,19 @@ def estimate(
     *,
     finds_extrinsics: bool = False,
 ) -> Generator[float, None, Estimate]:
-    """Estimate depth bias, times, relative poses and vignetting by Gauss-Newton steps.
+    """Estimate depth bias, shutter times, relative poses and vignetting by Gauss-Newton steps.
 
     The generator yields after each small step, such as the comparison of one pair, so that the
-    caller can spread the work over frames. It yields the amount of work, about 1 per millisecond.
+    caller can spread the work over frames. The yielded value is the work of the step; one unit
+    takes about 1 ms.
 
     Args:
-        views: Views by number.
+        views: Views by their numbers.
         pairs: Pairs of these views, in the order of time.
-        depth_bias: Initial coefficients of the depth bias, [3].
-        times_s: Initial times of the shutter, [3], in the order of `ShutterTiming`.
-        vignetting: Initial coefficients of the vignetting, [3, 3].
-        finds_extrinsics: True also estimates the error of the pose between depth and color.
+        depth_bias: Initial coefficients of the depth bias, [3] 1/m.
+        times_s: Initial shutter times, [3] seconds, in the order of `ShutterTiming`.
+        vignetting: Initial coefficients of the vignetting, [3, 3]: color channel by term.
+        finds_extrinsics: True to estimate the error of the pose between depth and color too.
     """
     shared = np.concatenate([depth_bias, times_s])
     linear = yield from _linearized(views, pairs, shared)

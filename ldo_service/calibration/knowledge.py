@@ -1,4 +1,4 @@
-"""Uncertainty of a camera's depth bias and timing of its shutter, as the tracker uses them."""
+"""Shutter timing of a camera and uncertainty of its depth bias, for the tracker."""
 
 from dataclasses import dataclass
 
@@ -7,9 +7,10 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CameraKnowledge:
-    """Uncertainty of a camera's depth bias, and estimated timing of its shutter.
+    """Estimated shutter timing of a camera, and uncertainty of its depth bias.
 
-    The tracker weights depth by the uncertainty, and compensates frames by the timing.
+    The tracker uses the timing to compensate the camera's motion within a frame. It weights depth
+    by the uncertainty.
     """
 
     # Standard deviation of the depth bias, divided by the one of an unknown camera; 0

@@ -1,20 +1,23 @@
 """Pose between depth and color camera, from outlines of near surfaces and gradients of color.
 
-Depth is registered to color with a pose of the depth camera. That pose may be wrong by the small
-increment xi = (r, s), a rotation vector r and a translation s. A surface point X of the depth image
-is then at X + cross(r, X) + s in the color camera. An outline, where depth jumps from a near
-surface to a far one, lies some pixels beside the edge in the color image. The shift along the
-normal n of the outline is n J (xi + v t) + w:
+Depth is registered to color with a pose of the depth camera. That pose may be wrong by a small
+increment xi = (r, s), where r is a rotation vector and s is a translation. The true position of a
+surface point X of the depth image is then X + cross(r, X) + s in the color camera.
+
+An outline is where depth jumps from a near surface to a far surface. The error xi shifts an outline
+away from its edge in the color image. Along the normal n of the outline, the shift in pixels is
+n J (xi + v t) + w:
 
 - J [2, 6] is the derivative of the pixel with respect to xi;
 - v [6] is the velocity of the camera in its own frame, rad/s and m/s;
-- t is the error of the delay of depth, seconds;
+- t is the error of `ShutterTiming.depth_delay_s`, seconds;
 - w is the width by which the depth camera widens all near surfaces, pixels.
 
 Each point of an outline has a profile: the gradient of color along n, at the pixels around the
-point. The estimate maximizes the sum over all points of the profile at the shift, blurred by a
-Gaussian that becomes narrower from round to round. The search starts at many rotations, because
-edges and texture of the near surfaces make other, lower maxima.
+point. A Gaussian blurs the profiles. The estimate maximizes the sum of all blurred profiles, each
+taken at the shift of its point. The blur becomes narrower from round to round. The search starts at
+many rotations, because edges and texture of the near surfaces cause other, lower maxima.
+
 Conventions: `ldo_service.geometry`.
 """
 
@@ -90,17 +93,19 @@ ITERATION_WORK = 1.2
 class Extrinsics:
     """Error of the pose with which depth was registered to color.
 
-    The true pose is exp(xi) T_color_depth if depth was registered with T_color_depth.
+    T_color_depth is the pose with which depth was registered. The true pose is
+    exp(xi) T_color_depth.
     """
 
     xi: np.ndarray  # [6] rotation in rad, then translation in m, in the color camera.
     covariance: np.ndarray  # [6, 6] of xi.
 
     def metrics(self) -> dict[str, float]:
-        """Return the components of xi, the image shift, and their standard deviations, by name.
+        """Return rotation, translation and image shift, with standard deviations, by metric name.
 
-        The names end in the units. The shift is that of depth in the image center, at
-        SHIFT_DEPTH_M: `depth_color_shift_u_mrad` and `depth_color_shift_v_mrad`.
+        Each name ends in the unit of its value. The image shift is the displacement of depth
+        against color in the image center, for a surface at the depth SHIFT_DEPTH_M. Its names are
+        `depth_color_shift_u_mrad` and `depth_color_shift_v_mrad`.
         """
         sigmas = np.sqrt(np.diag(COMPONENTS @ self.covariance @ COMPONENTS.T)).tolist()
         values = (COMPONENTS @ self.xi).tolist()
@@ -108,15 +113,17 @@ class Extrinsics:
 
 
 def outline_points(color: np.ndarray, depth_m: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return points on the outlines of near surfaces, with their profiles.
+    """Return points on the outlines of near surfaces, each with its profile.
+
+    A profile has the normalized color gradients at pixels along the normal of the outline.
 
     Args:
         color: Color image, [H, W, 3] uint8.
-        depth_m: Depth that is registered to it, [H, W] meters; 0 where unknown.
-        camera: Intrinsics of both.
+        depth_m: Depth registered to the color image, [H, W] meters; 0 where unknown.
+        camera: Intrinsics of both images.
 
     Returns:
-        Points, [N, COLUMNS] float32; see `SHARED`, `ROW` and `PROFILE`.
+        Points, [N, COLUMNS] float32. `SHARED`, `ROW` and `PROFILE` select the columns.
     """
     step = max(1, camera.width // WIDTH)
     height, width = camera.height // step, camera.width // step
@@ -197,11 +204,11 @@ def extrinsics(
     Args:
         points: Outline points of each view, in order of time; see `outline_points`.
         velocities: Velocity of the camera in each view, [6] rad/s and m/s, in the camera frame.
-        times_s: Readout of color, readout of depth and delay of depth, [3]. The motion of the
-            camera during these times shifts the outlines too.
+        times_s: Shutter times, [3] seconds, in the order of `ShutterTiming`. The camera's motion
+            during these times shifts the outlines too.
 
     Returns:
-        The estimate; None if there are too few points.
+        The estimate; None if there are too few points, or if they have no clear maximum.
     """
     if sum(map(len, points)) < MIN_OUTLINES:
         return None

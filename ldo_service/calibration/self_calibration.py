@@ -6,14 +6,13 @@
         ...  # Track the frame, with `calibration.knowledge`.
         change = calibration.observe(raw, T_odom_camera, motion)
 
-The timing of a rolling shutter is estimated together with the depth bias, since it distorts the
-views of a moving camera. The timing is not part of the correction. Tracking compensates the motion
-within each frame by the timing, and refines the timing (`ShutterState`).
+A rolling shutter distorts the views of a moving camera. Its timing is therefore estimated together
+with the depth bias, but is not part of the correction. The tracker uses the timing to compensate
+the motion within each frame, and refines the timing (`ShutterState`).
 
 Each call of `observe` does a bounded part of the work, so that the tracker skips no frame. An
-estimate is used only if held-out pairs of views confirm it: the correction must reduce their
-residuals clearly. After the estimate from the largest number of views, the calibration is finished
-and costs nothing more.
+estimate is used only if it clearly reduces the residuals of held-out pairs of views. The last
+estimate uses the largest number of views. After it, the calibration costs no more time.
 """
 
 import logging
@@ -52,8 +51,9 @@ class SelfCalibrationConfig:
     """Settings of the self-calibration.
 
     `max_depth_ratio` and `max_color_ratio` were chosen on seven recordings and simulations. The
-    ratio of depth was at most 0.85 with a strong bias, and above 0.94 otherwise. That of color was
-    at most 0.15 with strong vignetting, and above 0.45 otherwise.
+    depth ratio was at most 0.85 with a strong depth bias, and above 0.94 without a strong bias.
+    The color ratio was at most 0.15 with strong vignetting, and above 0.45 without strong
+    vignetting.
     """
 
     # Numbers of views at which an estimate starts. The estimate at the last number ends the
@@ -70,16 +70,16 @@ class SelfCalibrationConfig:
     def __post_init__(self) -> None:
         if any(n < 2 for n in self.views) or list(self.views) != sorted(set(self.views)):
             raise ConfigError(
-                named(self, "views") + " must ascend, and each number must be at least 2."
+                named(self, "views") + ": view counts must ascend, and each must be at least 2."
             )
         if not self.view_motion > 0 or min(self.lost_frames, self.min_pairs) < 1:
             raise ConfigError(
                 named(self, "view_motion", "lost_frames", "min_pairs")
-                + ": view_motion must be positive, the others at least 1."
+                + ": view_motion must be positive; lost_frames and min_pairs must be at least 1."
             )
         if not (0 <= self.max_depth_ratio <= 1 and 0 <= self.max_color_ratio <= 1):
             raise ConfigError(
-                named(self, "max_depth_ratio", "max_color_ratio") + " must be within 0..1."
+                named(self, "max_depth_ratio", "max_color_ratio") + ": both must be within 0..1."
             )
 
 
@@ -136,8 +136,8 @@ class SelfCalibration:
     ) -> "SelfCalibration":
         """Return a calibration of a camera whose correction is known from an earlier run.
 
-        The correction is used from the first frame on. Its depth bias or its vignetting changes
-        only if held-out views confirm the estimate from max(`config.views`) views.
+        The correction is used from the first frame on. Only the estimate from the largest number
+        of views, max(`config.views`), may change it.
         """
         calibration = SelfCalibration(config)
         calibration.correction = replace(correction, timing=ShutterTiming())
@@ -156,7 +156,7 @@ class SelfCalibration:
 
     @property
     def knowledge(self) -> CameraKnowledge:
-        """Sigma of the depth bias and estimated timing of the shutter, to track the next frame."""
+        """Depth-bias uncertainty and estimated shutter timing, to track the next frame."""
         relative = 1.0
         if not self.is_undecided:
             covariance = self.depth_bias_covariance * DEPTH_PRIOR
@@ -170,7 +170,7 @@ class SelfCalibration:
         T_odom_camera: np.ndarray | None,
         motion: FrameMotion | None = None,
     ) -> CorrectionChange | None:
-        """Do one part of the work: continue an estimate, or make a view of the frame.
+        """Do one part of the work: continue an estimate, or make a calibration view of the frame.
 
         Args:
             raw: The frame without correction.
@@ -313,7 +313,7 @@ class SelfCalibration:
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, dict[str, Any]]:
-        """Return the state as named parts; a part that did not change is the same object."""
+        """Return the state as named parts; snapshots share the objects of unchanged parts."""
         now = {
             **self.correction.pack(),
             "ratios": list(self.ratios),
@@ -379,7 +379,7 @@ class SelfCalibration:
                     self._steps_done += 1
 
     def metrics(self) -> dict[str, float]:
-        """Return the number of views, and whether each correction is in use, 0 or 1."""
+        """Return the number of views, and for each correction 1 if it is in use, else 0."""
         return {
             # Views that the self-calibration has made so far; 0 when it is finished.
             "calibration_views": float(len(self._views)),

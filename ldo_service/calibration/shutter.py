@@ -1,9 +1,10 @@
-"""Compensation of the camera's motion while a frame is recorded.
+"""Compensation for the motion of the camera while a frame is recorded.
 
-A rolling shutter exposes the rows of an image one after the other, and a depth camera measures at
-another time than the color camera. Both errors grow with the velocity of the camera.
-`FrameMotion.compensated` converts color and depth to an image whose pixels are all recorded at the
-same time, that of the middle row. Conventions: `ldo_service.geometry`.
+A rolling shutter exposes the rows of an image one after the other. A depth camera may also measure
+earlier or later than the color camera. If the camera moves, both effects displace pixels. The
+displacement grows with the velocity of the camera. `FrameMotion.compensated` warps color and depth
+as if all pixels were recorded at the time of the middle row of color.
+Conventions: `ldo_service.geometry`.
 """
 
 from collections.abc import Mapping
@@ -27,7 +28,7 @@ MAX_RAD_PER_S, MAX_M_PER_S = 10.0, 10.0
 
 @dataclass(frozen=True, slots=True)
 class ShutterTiming:
-    """Durations and delay with which a camera records the rows of color and depth."""
+    """Readout durations of color and depth, and delay of depth after color."""
 
     readout_s: float = 0.0  # Time from the first to the last row of the color image.
     depth_readout_s: float = 0.0  # Time from the first to the last row of depth; 0: simultaneous.
@@ -39,15 +40,15 @@ class ShutterTiming:
 
     @property
     def times_s(self) -> tuple[float, float, float]:
-        """Readout of color, readout of depth and delay of depth."""
+        """Readout duration of color, readout duration of depth and delay of depth, seconds."""
         return self.readout_s, self.depth_readout_s, self.depth_delay_s
 
     def differs(self, other: "ShutterTiming", by_s: float) -> bool:
-        """Return whether a time differs from that of another timing by more than `by_s`."""
+        """Return whether any time differs by more than `by_s` from the same time in `other`."""
         return any(abs(a - b) > by_s for a, b in zip(self.times_s, other.times_s, strict=True))
 
     def metrics(self) -> dict[str, float]:
-        """Return the times by name, ms."""
+        """Return the times in milliseconds, by metric name."""
         return {name.removesuffix("_s") + "_ms": 1e3 * t for name, t in self.pack().items()}
 
     def pack(self) -> dict[str, float]:
@@ -63,7 +64,7 @@ class ShutterTiming:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FrameMotion:
-    """Velocity of the camera while it recorded a frame, and the timing of the recording."""
+    """Velocity of the camera during a frame, and timing of its shutter."""
 
     # [6] rotation in rad/s, then translation in m/s, in the camera frame: the camera is at
     # T_camera * exp(velocity * t) after the time t.
@@ -74,9 +75,10 @@ class FrameMotion:
     def between(
         T_before: np.ndarray, T_after: np.ndarray, interval_s: float, timing: ShutterTiming
     ) -> "FrameMotion | None":
-        """Return the mean motion between two camera poses [4, 4]; None if it is implausible.
+        """Return the mean motion between two camera poses [4, 4], or None.
 
-        A wrong stamp or a jump of the pose would give a velocity that no camera has.
+        The result is None if the interval is below MIN_INTERVAL_S, or if the velocity is too high
+        to be real. A wrong stamp or a jump of the pose causes such a velocity.
         """
         if interval_s < MIN_INTERVAL_S:
             return None
@@ -97,8 +99,8 @@ class FrameMotion:
     def compensated(self, frame: RgbdFrame) -> RgbdFrame:
         """Return the frame as if all its pixels were recorded at the time of the middle row.
 
-        If the camera does not move or its shutter has no delays, the frame itself is returned.
-        Pixels that the frame does not show become black, and their depth 0.
+        If the velocity is 0 or all shutter times are 0, the frame itself is returned. Where the
+        frame has no data, the result is black and its depth is 0.
         """
         if not self.timing or not self.velocity.any():
             return frame
@@ -110,8 +112,9 @@ class FrameMotion:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Warp an image and its depth as if all pixels were recorded at the time of the middle row.
 
-        A pixel (u, v) of the result is read from (u, v) + f t, where f is the image motion per
-        second of the surface point at (u, v), and t is the time at which its row was recorded.
+        A pixel (u, v) of the result is read from the pixel (u, v) + f t of the input. Here f is the
+        image motion of the surface point at (u, v), in pixels per second. The time t is when the
+        input recorded this point, relative to the middle row of color.
 
         Args:
             image: Image, [H, W] or [H, W, 3].
@@ -134,7 +137,7 @@ class FrameMotion:
 
         Args:
             image: Color image without this distortion, such as a rendering, [H, W, 3].
-            depth_m: Its depth, [H, W] meters; 0 where unknown.
+            depth_m: Depth of the image, [H, W] meters; 0 where unknown.
             camera: Camera of the image.
         """
         depth_m = np.ascontiguousarray(depth_m)
@@ -150,12 +153,12 @@ class FrameMotion:
 
 
 def displacement_rad(velocity: np.ndarray, timing: ShutterTiming, depth_m: float) -> float:
-    """Return the largest image motion that a velocity [6] causes during a frame, in rad.
+    """Return the largest angle, in rad, by which a velocity [6] displaces pixels of a frame.
 
     Args:
-        velocity: Rotation in rad/s and translation in m/s; or a difference of two velocities.
-        timing: Timing of the camera.
-        depth_m: Median depth of the scene.
+        velocity: Rotation in rad/s, then translation in m/s; or the difference of two velocities.
+        timing: Shutter timing of the camera.
+        depth_m: Median depth of the scene, meters.
     """
     speed = np.linalg.norm(velocity[:3]) + np.linalg.norm(velocity[3:]) / depth_m
     color_s = abs(timing.readout_s) / 2

@@ -1,4 +1,4 @@
-"""Calibration views, from which vignetting and depth bias are estimated, and pairs of views."""
+"""Calibration views and their pairs, from which vignetting and depth bias are estimated."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -46,7 +46,7 @@ REFINEMENTS, MIN_INLIER_RATIO = 5, 0.5
 
 @dataclass(frozen=True, slots=True)
 class CalibrationView:
-    """Frame of a camera, reduced to what the self-calibration compares."""
+    """Reduced frame with the depth, colors, corners and outlines that self-calibration compares."""
 
     number: int  # Running number of the view.
     camera: Camera  # Camera of the full image.
@@ -79,7 +79,12 @@ class CalibrationView:
 
 
 def block_centers(camera: Camera, block: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return u [1, w] and v [h, 1] of the centers of the blocks of a view, in pixels."""
+    """Return the block centers of a view as u [1, w] and v [h, 1], in pixels of the full image.
+
+    Args:
+        camera: Camera of the full image.
+        block: Side of a block, pixels.
+    """
     u, v = (block * np.arange(n // block) + (block - 1) / 2 for n in (camera.width, camera.height))
     return u[None, :], v[:, None]
 
@@ -127,8 +132,8 @@ class ViewMaker:
 
         Args:
             frame: The frame.
-            T_odom_camera: Its pose, [4, 4]. It predicts where the corners tracked in the last view
-                are now. None while tracking is LOST.
+            T_odom_camera: Pose of the frame, [4, 4], which predicts the new pixels of the corners
+                that were tracked in the last view; None while tracking is LOST.
             velocity: Velocity of the camera, see `CalibrationView.velocity`; None if unknown.
         """
         camera = frame.camera
@@ -253,7 +258,7 @@ def _follow(
 
 @dataclass(frozen=True, slots=True)
 class ViewPair:
-    """Two views that show the same surface, with the corners that both show."""
+    """Two views of the same surface, with their common corners."""
 
     first: int  # Number of the view whose depth is used.
     second: int  # Number of the other view.
@@ -271,7 +276,8 @@ class ViewPair:
 def pair_of(first: CalibrationView, second: CalibrationView) -> ViewPair | None:
     """Estimate the relative pose of two views from the corners that both show.
 
-    The estimate starts at the poses of the tracker, or else with PnP RANSAC.
+    The relative pose by the tracker is refined. If the tracker has no such pose, or if too few
+    corners agree with the refined pose, PnP RANSAC estimates the pose.
 
     Returns:
         The pair. None if the views have too few corners in common, if the corners hardly moved, or
@@ -340,7 +346,7 @@ def _refined(
 def reprojection(
     camera: Camera, T: np.ndarray, points: np.ndarray, pixels: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return reprojection errors, their derivatives and the moved points.
+    """Return reprojection errors, their derivatives, and the points in the camera frame.
 
     Args:
         camera: Intrinsics.
@@ -349,8 +355,8 @@ def reprojection(
         pixels: Measured pixels, [N, 2].
 
     Returns:
-        Errors [N, 2] in pixels; their derivatives [N, 2, 6] with respect to rotation and
-        translation of exp(x) T; and the points in the camera, [N, 3] meters.
+        Errors [N, 2] in pixels; their derivatives [N, 2, 6] with respect to the increment x of
+        the transform exp(x) T, rotation first; and the points in the camera frame, [N, 3] meters.
     """
     moved = points @ T[:3, :3].T + T[:3, 3]
     x, y, z = moved.T

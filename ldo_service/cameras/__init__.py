@@ -1,1 +1,1 @@
-"""Adapters from third-party camera software to frames of `camera/rgbd`."""
+"""Adapters from third-party camera software to messages of the topic `camera/rgbd`."""

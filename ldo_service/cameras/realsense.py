@@ -1,4 +1,4 @@
-"""RealSense camera on USB: depth aligned to color, intrinsics and units from the device."""
+"""Frames of a RealSense on USB, with depth aligned to color and the device's intrinsics."""
 
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
@@ -44,7 +44,7 @@ def frames(stream: RealSenseStream) -> Generator[CameraRgbd, None, None]:
     """Open a RealSense, and iterate over its frames without end.
 
     Raises:
-        ConfigError: No RealSense is connected, or it does not support the stream.
+        ConfigError: No RealSense is connected, or the device does not support the stream settings.
         DataError: The camera stopped sending frames.
     """
     rs = library()
@@ -54,9 +54,9 @@ def frames(stream: RealSenseStream) -> Generator[CameraRgbd, None, None]:
         profile = pipeline.start(_config(rs, stream))
     except RuntimeError as error:
         raise ConfigError(
-            f"the RealSense does not start {stream.width}x{stream.height} at {stream.rate_hz} Hz "
-            f"({error}). Check that no other program uses it; `rs-enumerate-devices` lists the "
-            "supported streams."
+            f"the RealSense cannot stream {stream.width}x{stream.height} at {stream.rate_hz} Hz "
+            f"({error}). Check that no other program uses the camera. Choose a stream that "
+            "`rs-enumerate-devices` lists."
         ) from error
     try:
         color = profile.get_stream(rs.stream.color).as_video_stream_profile()

@@ -43,7 +43,7 @@ Notify = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class RosTopics:
-    """ROS names of the topics of a camera, and properties of its images."""
+    """Names of the ROS topics of a camera, and properties of its images."""
 
     color: str  # Topic of the color images.
     depth: str  # Topic of the depth images.
@@ -64,7 +64,7 @@ class RosTopics:
 
     @property
     def camera_info(self) -> str:
-        """Topic of the camera info of color."""
+        """Topic of the color camera's CameraInfo messages."""
         base = self.color.rsplit("/", 1)[0] if is_compressed(self.color) else self.color
         return self.info or base.rpartition("/")[0] + "/camera_info"
 
@@ -103,7 +103,7 @@ class Inbox:
             self._changed.notify()
 
     def take(self, timeout_s: float) -> tuple[str, bytes] | None:
-        """Return topic and body of the oldest sample, or None if none arrives in time."""
+        """Return topic and body of the oldest sample; None if no sample arrives in `timeout_s`."""
         with self._changed:
             self._changed.wait_for(lambda: bool(self._waiting), timeout_s)
             return self._waiting.popleft() if self._waiting else None
@@ -135,7 +135,7 @@ class RosCamera:
 
     @property
     def statistics(self) -> str:
-        """Text with the number of frames, and of rejected, unpaired and dropped messages."""
+        """Text with the numbers of frames, rejected and unpaired images, and dropped messages."""
         return (
             f"{self.frames_made} frames, {self.rejected} images rejected, {self._pairing.lost_a} "
             f"color and {self._pairing.lost_b} depth images unpaired, {self._inbox.dropped} dropped"

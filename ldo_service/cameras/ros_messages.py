@@ -1,7 +1,7 @@
-"""Decoding of ROS 2 images and camera infos from CDR, as a bridge forwards it or a bag stores it.
+"""Decoding of ROS 2 images and camera infos from CDR, the format of bridges and bags.
 
-Encodings are those of `sensor_msgs/image_encodings`; depth is in millimeters as 16UC1 and in meters
-as 32FC1 (REP 118).
+Image encodings are those of `sensor_msgs/image_encodings`. Depth in the encoding 16UC1 is in
+millimeters, and depth in 32FC1 is in meters (REP 118).
 """
 
 import struct
@@ -126,8 +126,8 @@ def read_camera(body: bytes, is_rectified: bool) -> CameraModel:
 
     Args:
         body: The message in CDR.
-        is_rectified: True takes the intrinsics from P (its left 3x3), without distortion, instead
-            of K and D.
+        is_rectified: True if the images are rectified. The intrinsics are then the left 3x3 block
+            of P, without distortion. Otherwise, K is the intrinsics and D is the distortion.
 
     Raises:
         FrameError: The message is invalid, or its distortion model is not supported.
@@ -161,7 +161,7 @@ def camera_model(info: Any, is_rectified: bool) -> CameraModel:
 def joined(
     color: RosImage, depth: RosImage, camera: CameraModel, frame: int, is_registered: bool
 ) -> CameraRgbd:
-    """Combine a color and a depth image to a frame with the stamp of color.
+    """Combine a color image and a depth image into a frame with the stamp of the color image.
 
     Args:
         color: Color image.
@@ -175,16 +175,16 @@ def joined(
     """
     if depth.frame_id != color.frame_id and not is_registered:
         raise FrameError(
-            f"depth has frame_id {depth.frame_id!r} and color {color.frame_id!r}, expected equal "
-            "ones. Subscribe to depth that is registered to color (realsense2_camera: "
-            "align_depth.enable:=true; other cameras: the node `register` of depth_image_proc). If "
-            "this depth is already registered, give --registered."
+            f"the frame_id of depth is {depth.frame_id!r}, but that of color is "
+            f"{color.frame_id!r}. Subscribe to depth that is registered to color: set "
+            "align_depth.enable:=true for realsense2_camera, or use the node `register` of "
+            "depth_image_proc. If this depth is already registered, add --registered."
         )
     if (color.image.width, color.image.height) != (camera.width, camera.height):
         raise FrameError(
-            f"color has {color.image.width}x{color.image.height} pixels and its camera info "
-            f"{camera.width}x{camera.height}. Check that the camera info belongs to this color "
-            "topic."
+            f"the color image has {color.image.width}x{color.image.height} pixels, but its camera "
+            f"info states {camera.width}x{camera.height}. Check that the camera info belongs to "
+            "this color topic."
         )
     try:
         return CameraRgbd(
@@ -258,8 +258,8 @@ def _pixels(message: Any, dtype: np.dtype, channels: int) -> np.ndarray:
     if step < row_bytes or len(message.data) != step * height:
         raise FrameError(
             f"a {message.encoding} image of {width}x{height} pixels needs {height} rows of at "
-            f"least {row_bytes} bytes, but has {len(message.data)} bytes in rows of {step}. Check "
-            "the camera driver."
+            f"least {row_bytes} bytes, but has {len(message.data)} bytes with {step} per row. "
+            "Check the camera driver."
         )
     rows = np.reshape(message.data, (height, step))[:, :row_bytes]
     return np.ascontiguousarray(rows).view(dtype).reshape(height, width, channels)

@@ -115,11 +115,11 @@ def batch(
 ) -> None:
     """Run, evaluate and export many recordings, on this machine or on a Ray cluster.
 
-    Each recording has its own process and its own folder WHERE/NAME-KEY. The key is a digest of the
-    content of the recording, the configuration and the version. If you repeat the command, finished
-    recordings are skipped, and failed or interrupted ones are processed again. A failed recording
-    does not stop the others. WHERE/batch.json and WHERE/index.html list all recordings of the last
-    call.
+    Each recording has its own process and its own folder WHERE/NAME-KEY. KEY is a digest of the
+    content of the recording, the configuration and the version of LDO-SLAM. If you repeat the
+    command, finished recordings are skipped, and failed or interrupted recordings are processed
+    again. A failed recording does not stop the others. WHERE/batch.json and WHERE/index.html list
+    all recordings of the last call.
 
       ldo batch ~/night/* --out runs/night
       ldo batch s3://robots/night s3://robots/day/*.mcap --out s3://results/night --export splat
@@ -251,7 +251,7 @@ class _Progress:
         self._started_s = time.perf_counter()
 
     def begin(self, jobs: list[BatchJob]) -> None:
-        """Start the clock of the estimate, with all recordings that will run."""
+        """Start the estimate of the remaining time for the recordings that will run."""
         sizes = {job.recording.source: float(job.recording.size_bytes) for job in jobs}
         is_known = all(sizes.values())
         self._weights = {source: size if is_known else 1.0 for source, size in sizes.items()}

@@ -30,9 +30,9 @@ class BenchRender:
     """Measure how long one iteration of the Gaussian optimizer takes on this machine.
 
     The scene is synthetic. The times are medians over all repeats, in milliseconds of wall time.
-    The step of Adam runs inside the backward pass: backward_ms is the time of the pass without the
-    step, and adam_ms is the time that the step adds. iteration_ms is the time of forward pass,
-    loss, backward pass and step together.
+    The backward pass includes the step of the optimizer Adam. backward_ms is the time of the
+    backward pass without this step, and adam_ms is the time that the step adds. iteration_ms is the
+    time of forward pass, loss, backward pass and step together.
     """
 
     gaussians: Annotated[int, argument(help="Gaussians in view")] = 100_000
@@ -45,15 +45,15 @@ class BenchRender:
 
 @dataclass(frozen=True)
 class BenchMap:
-    """Measure the mapper alone on a source: frames per second, CPU time by stage, and errors.
+    """Measure the mapper alone on a source: frames per second, CPU time per step, and errors.
 
     The source is tracked once. Its keyframes are then mapped at their final poses on one thread, so
-    that measurements with different settings differ by the mapper alone. FPS is the number of
-    frames per CPU second of the mapper. PSNR and depth L1 are those of every fifth frame, which is
-    held out; the exposure of such a frame is interpolated between keyframes.
+    that the tracker does not affect a comparison of settings. FPS is the number of frames per CPU
+    second of the mapper. PSNR and depth L1 are those of every fifth frame, which is held out; the
+    exposure of such a frame is interpolated between keyframes.
 
-    CPU times depend on what else the machine does. For a ratio of two settings, run both commands
-    at the same time, or one directly after the other.
+    CPU times depend on what else the machine does. To compare two settings, run both commands at
+    the same time, or one directly after the other.
 
       ldo bench map ~/data/kitchen --frames 200 --runs build/bench --save sharp.json
       ldo bench map ~/data/kitchen --frames 200 --runs build/bench --baseline sharp.json
@@ -101,8 +101,9 @@ def bench(
     """Measure the speed of the Gaussian optimizer, or of the mapper on a source.
 
     Set the environment variable LDO_ISA to avx512, avx2 or baseline to choose the instruction set.
-    With --device cuda, the results of the GPU are compared with those of the CPU first. Nothing is
-    measured if they differ. The alignment of a frame by the tracker is measured too.
+    With --device cuda, the command first compares the results of the GPU with those of the CPU. If
+    they differ, it measures nothing. If they agree, `render` measures an iteration of the optimizer
+    and the alignment of a frame on both devices.
 
       ldo bench
       ldo bench --device cuda
@@ -119,7 +120,7 @@ def bench_render(verb: BenchRender, device: str = "cpu") -> None:
 
     Raises:
         ConfigError: A number is out of range.
-        DeviceError: With the device cuda, there is no GPU, or its results are wrong.
+        DeviceError: The device is cuda, but no GPU is available, or its results are wrong.
     """
     width, height = _pixels(verb.size)
     if not min(verb.gaussians, verb.threads, verb.repeats) >= 1:
@@ -196,7 +197,7 @@ def required_gpu() -> Gpu:
     """Return the GPU of this machine.
 
     Raises:
-        DeviceError: There is none. The text says what the benchmark needs.
+        DeviceError: The machine has no suitable GPU. The message states the requirements.
     """
     try:
         return find_gpu()
@@ -212,7 +213,7 @@ def bench_map(verb: BenchMap, device: str = "cpu") -> None:
 
     Raises:
         ConfigError: A number is out of range, or the baseline has other frames.
-        DeviceError: With the device cuda, there is no GPU, or its results are wrong.
+        DeviceError: The device is cuda, but no GPU is available, or its results are wrong.
     """
     if verb.frames < 2 or verb.refine_iterations < 0:
         raise ConfigError(
@@ -285,14 +286,14 @@ def require_comparable(measured: MapMeasurement, baseline: MapMeasurement) -> No
     ours, theirs = ((m.source, m.frames, m.keyframes) for m in (measured, baseline))
     if ours != theirs:
         raise ConfigError(
-            f"--baseline has {theirs[2]} keyframes in {theirs[1]} frames of {theirs[0]}, this "
-            f"measurement has {ours[2]} in {ours[1]} of {ours[0]}. They must be the same; make a "
-            "new baseline with --save."
+            f"--baseline has {theirs[2]} keyframes in {theirs[1]} frames of {theirs[0]}, but this "
+            f"measurement has {ours[2]} keyframes in {ours[1]} frames of {ours[0]}. Make a new "
+            "baseline with --save."
         )
 
 
 def measurement_table(found: MapMeasurement, baseline: MapMeasurement | None) -> Table:
-    """Return a table of a measurement, with a baseline and the ratios to it if there is one."""
+    """Return a table of a measurement; a given baseline adds columns for its values and ratios."""
     table = Table("", Column("measured", justify="right"))
     if baseline:
         for name in ("baseline", "ratio"):

@@ -95,11 +95,11 @@ def depth_errors_mm(correction: CameraCorrection, camera: Camera, depth_m: float
     Args:
         correction: Correction of the camera.
         camera: Rectified camera of the keyframes.
-        depth_m: Measured depth.
+        depth_m: Measured depth, meters.
 
     Returns:
-        Measured minus corrected depth, [2], top left and top right. The error in the center is 0,
-        and the error is equal in opposite corners.
+        Measured minus corrected depth in mm, [2]: in the top left and the top right corner. Both
+        bottom corners have the error of the opposite top corner. The error in the center is 0.
     """
     u, v = np.array([0.0, camera.width - 1.0]), np.zeros(2)
     bias = bias_basis(u, v, camera) @ np.array(correction.depth_bias)

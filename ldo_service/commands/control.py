@@ -42,11 +42,11 @@ def control(
 ) -> None:
     """Pause, resume, save or reset a running service, refine its map, or add a label.
 
-    pause, resume, save and reset return when every actor has executed them. If an actor did not,
-    the message names the actor and the exit code is 4.
+    pause, resume, save and reset return when every actor has executed them. If an actor does not
+    execute the command, an error names the actor and the exit code is 4.
 
     `refine` only sends a request to the mapper and returns immediately. The mapper runs the
-    iterations before it takes its next keyframe.
+    iterations of the refinement before it takes its next keyframe.
 
       ldo control reset
       ldo control refine --iterations 500

@@ -107,11 +107,11 @@ def doctor(
 
     `ldo doctor calibration DIR` prints what the run in DIR has found about its camera: depth bias,
     vignetting, and the times at which rows of color and depth are recorded. A line marked warn
-    says how a large value affects the results and how to avoid this.
+    says how a large value affects the results and how to avoid this effect.
 
-    For a running service, the last lines are a forecast: what a keyframe takes of memory, disk and
-    time, and the bounds that are reached within 24 hours at this rate. `ldo doctor forecast DIR`
-    prints a forecast for the state folder DIR.
+    For a running service, the last lines are a forecast. They state how much memory, disk space and
+    time a keyframe takes, and which limits the service reaches within 24 hours at this rate.
+    `ldo doctor forecast DIR` prints a forecast for the state folder DIR.
 
       ldo doctor
       ldo doctor --window-s 300
@@ -123,8 +123,8 @@ def doctor(
     if check == "service":
         if folder is not None:
             raise ConfigError(
-                f"the folder {folder} applies only to `ldo doctor calibration {folder}` or `ldo "
-                f"doctor forecast {folder}`. Remove it, or add one of these words."
+                f"`ldo doctor service` checks no folder, but {folder} is given. Remove it, or use "
+                f"`ldo doctor calibration {folder}` or `ldo doctor forecast {folder}`."
             )
         show(
             (
@@ -269,7 +269,7 @@ def certificates(endpoint: str, keys: Path | None) -> Iterator[Finding]:
 def seen(
     robot: str, endpoint: str, keys: Path | None = None, window_s: float = WINDOW_S
 ) -> tuple[list[ActorStatus], dict[str, list[tuple[float, Health]]]]:
-    """Listen to a service.
+    """Receive the heartbeats of the actors of a service for some time.
 
     Args:
         robot: Name of the robot.
@@ -278,8 +278,8 @@ def seen(
         window_s: Duration, seconds.
 
     Returns:
-        The status of every actor. Then, by actor, a list of the heartbeats, each with its arrival
-        time in seconds.
+        The status of every actor, and the list of heartbeats of each actor by its name. Each
+        heartbeat has its arrival time on the monotonic clock, seconds.
 
     Raises:
         ConfigError: No router answers on the endpoint.

@@ -46,8 +46,8 @@ NO_LPIPS = "LPIPS is not computed; --lpips FILE.onnx adds it."
 def label_table(rows: list[LabelErrors]) -> Table:
     """Return a table of label metrics.
 
-    It has a row for each combination of a map, a list of class names by which the labels are scored
-    (`LabelErrors.lists`), and a minimum class size (`GATES`).
+    The table has a row for each combination of map, list of class names (`LabelErrors.lists`) and
+    minimum class size (`GATES`).
     """
     table = Table("map", "names", "classes", *FIGURES, "per image", "frames")
     for row in rows:
@@ -63,7 +63,7 @@ def label_table(rows: list[LabelErrors]) -> Table:
 
 
 def open_table(rows: list[LabelErrors], calls_per_frame: float | None) -> Table:
-    """Return a table of label consistency, labels beyond COCO, and requests to the labeller.
+    """Return a table of label consistency, scores of names outside COCO, and labeller requests.
 
     Args:
         rows: Label errors of each map.
@@ -167,7 +167,7 @@ def print_results(
         results: The results.
         lpips: Network of LPIPS; None if LPIPS was not computed.
         config: Configuration of the run.
-        has_protocol: Print the definition of the metrics above each table.
+        has_protocol: True to print the definition of the metrics above each table.
     """
     console = Console(highlight=False, width=None if sys.stdout.isatty() else WIDTH)
 
@@ -258,7 +258,7 @@ def _spread(values: tuple[float, ...], factor: float, unit: str) -> str:
 
 
 def rendering_table(rows: list[RenderingErrors], *, has_lpips: bool) -> Table:
-    """Return a table with the image errors of each map and protocol."""
+    """Return a table with the image errors of each map under each evaluation protocol."""
     columns = {"PSNR dB": ("psnr_db", 1, ".2f"), "SSIM": ("ssim", 1, ".3f")}
     if has_lpips:
         columns["LPIPS"] = ("lpips", 1, ".3f")

@@ -39,9 +39,9 @@ def info(
 ) -> None:
     """Print what is in a source: streams, rate, gaps, calibration, depth and ground truth.
 
-    The command reads all stamps and five of the frames. A gap is an interval of more than 1.5
-    median intervals. To estimate the time of `ldo run` on this machine, the command runs the first
-    30 frames, which takes some seconds. --probe 0 skips this.
+    The command reads all stamps and five of the frames. A gap is an interval between two frames
+    that is longer than 1.5 times the median interval. To estimate the time of `ldo run` on this
+    machine, the command runs the first 30 frames, which takes some seconds. --probe 0 skips this.
 
       ldo info ~/data/rgbd_dataset_freiburg1_desk
       ldo info desk.bag --probe 0

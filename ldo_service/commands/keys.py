@@ -31,8 +31,8 @@ Days = Annotated[int, argument(metavar="N", help="days that the keys are valid")
 class New:
     """Create a certificate authority in a new folder.
 
-    Keep the private key of the authority on this machine. Copy only the keys that `ldo keys add`
-    makes to other machines.
+    Keep the private key of the authority on this machine. Copy to other machines only the keys that
+    `ldo keys add` makes.
     """
 
     folder: Folder
@@ -45,9 +45,9 @@ class AddKeys:
 
     Copy this folder to the machine of the program, and pass it to the program with --keys. The
     command also updates the access control list `access.yaml` in the folder of each service. Copy
-    the new list into the key folder of each running service, which uses it within seconds. Two
-    kinds of services read their keys only at their start, so restart them: services under systemd,
-    and services with --client.
+    the new list into the key folder of each running service. Services under systemd and services
+    with --client read their keys only at their start, so restart them. All other services use the
+    new list within seconds.
 
       ldo keys add DIR service mule --robot mule --host mule.local
       ldo keys add DIR camera front --robot mule
@@ -91,10 +91,10 @@ class ListKeys:
 class RevokeKeys:
     """Revoke keys, and delete their folder on this machine.
 
-    Copy the new `access.yaml` into the key folder of each running service, which then rejects the
-    keys within seconds. Two kinds of services read their keys only at their start, so restart them:
-    services under systemd, and services with --client. A separate router needs a new configuration
-    of `ldo keys router` and a restart.
+    Copy the new `access.yaml` into the key folder of each running service. Services under systemd
+    and services with --client read their keys only at their start, so restart them. All other
+    services reject the revoked keys within seconds. For a separate router, make a new configuration
+    with `ldo keys router`, and restart the router.
     """
 
     folder: Folder

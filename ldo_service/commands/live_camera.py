@@ -35,7 +35,7 @@ class RealSenseOptions:
     fps: Annotated[int, argument(metavar="HZ", help="frame rate of color and depth")] = 30
 
     def stream(self) -> RealSenseStream:
-        """Return the stream with these options.
+        """Return the stream settings that these options select.
 
         Raises:
             ConfigError: The size or the rate is invalid.
@@ -95,7 +95,7 @@ class RosOptions:
     ] = False
 
     def topics(self) -> RosTopics:
-        """Return the topics.
+        """Return the ROS topics that these options select.
 
         Raises:
             ConfigError: A topic is missing or has an invalid name.

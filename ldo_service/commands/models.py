@@ -28,8 +28,8 @@ Name = Annotated[
 class AddModel:
     """Check an ONNX network, copy it into the registry and register it under NAME.
 
-    FILE is a detector. With --text or --embeddings, FILE is instead the image encoder of a pair in
-    the layout of CLIP. Such a pair labels regions.
+    By default, FILE is a detector. With --text or --embeddings, FILE is the image encoder of an
+    encoder pair in the layout of CLIP. An encoder pair labels regions.
 
       ldo models add nano yolox_nano.onnx --license Apache-2.0
       ldo models add clip visual.onnx --text text.onnx --vocabulary bpe_simple_vocab_16e6.txt.gz
@@ -182,7 +182,7 @@ def show(console: Console) -> None:
     console.print(f"{demo_networks.NAME}, a detector and a pair, comes with the package.")
     if damaged:
         raise LdoError(
-            f"networks marked damaged above: {damaged}. Remove each with `ldo models remove NAME`, "
+            f"damaged networks in the table: {damaged}. Remove each with `ldo models remove NAME`, "
             "and add it again with `ldo models add`."
         )
 

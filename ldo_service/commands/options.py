@@ -141,7 +141,7 @@ Json = Annotated[bool, argument(help="print one JSON document and nothing else")
 
 
 def with_preset(settings: tuple[str, ...], preset: str) -> tuple[str, ...]:
-    """Return the settings of --set, preceded by one that selects the preset of --preset, if any."""
+    """Return the settings of --set, preceded by `preset=NAME` if --preset NAME is given."""
     return (f"preset={preset}", *settings) if preset else settings
 
 
@@ -153,7 +153,7 @@ def with_device(config: Config, device: str | None) -> Config:
 
 
 def with_topics(settings: tuple[str, ...], topics: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the settings of --set, followed by one setting with all topics of --topic, if any."""
+    """Return the settings of --set, followed by `dataset.topics=[...]` if --topic is given."""
     return (*settings, f"dataset.topics=[{', '.join(topics)}]") if topics else settings
 
 

@@ -79,11 +79,11 @@ def publish(
 
     `realsense` is a camera on USB. `ros2` reads topics of ROS 2 that a Zenoh bridge forwards.
 
-    Frames keep the stamps of the source. Stamps must ascend: the service rejects a frame that is
-    not later than the frame before, unless it is earlier by more than a second, as after a restart
-    of the camera. --restamp replaces each stamp by the time of sending, so that you can send a data
-    set again. A subscriber on this machine can then compute the delay of a pose: its clock minus
-    the stamp of the pose.
+    Frames keep the stamps of the source. The service rejects a frame whose stamp equals the
+    stamp of the frame before, or is up to a second earlier. It accepts a stamp that is more than a
+    second earlier, as after a restart of the camera. --restamp replaces each stamp by the time of
+    sending, so that you can send a data set again. A subscriber on this machine can then compute
+    the delay of a pose: the present time minus the stamp of the pose.
 
       ldo publish ~/data/rgbd_dataset_freiburg1_desk --rate 15
       ldo publish ~/data/rgbd_dataset_freiburg1_desk --restamp
@@ -177,7 +177,7 @@ class SequencePublisher:
         self.sent = self.bad = self.unreceived = 0
 
     def send(self, index: int) -> None:
-        """Send one frame, and before it the poses of the odometry prior up to its stamp.
+        """Send the poses of the odometry prior up to the stamp of a frame, then the frame.
 
         A frame that cannot be read is counted in `bad` and skipped.
         """

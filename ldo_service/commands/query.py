@@ -53,8 +53,9 @@ def query(
 ) -> None:
     """Find objects by name: print their boxes in the map, best match first.
 
-    TEXT also finds synonyms, broader and narrower terms: "sofa" finds couches. If no object
-    matches, the text encoder of an encoder pair compares TEXT with the names of the objects.
+    The search also uses synonyms, broader terms and narrower terms of TEXT: "sofa" finds couches.
+    If no object matches, a text encoder searches for names of similar meaning. --model chooses the
+    encoder.
 
       ldo query DIR "potted plant"
       ldo query live chair --json

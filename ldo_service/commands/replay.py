@@ -1,4 +1,4 @@
-"""Command `ldo replay`: replay a recording, and compare the outputs with the recorded ones."""
+"""Command `ldo replay`: replay a recording, and compare new outputs with the recorded outputs."""
 
 import itertools
 from collections import Counter
@@ -23,11 +23,12 @@ def replay(
         tyro.conf.arg(metavar="NAME", help="replay only this actor; may be repeated; default: all"),
     ] = (),
 ) -> None:
-    """Replay a recording with new actors, and compare their outputs with the recorded outputs.
+    """Replay a recording with newly started actors, and compare their outputs with the recording.
 
-    The replay also repeats restarts and failures, and the recorded limits on how many messages an
-    actor may send at each step. It publishes nothing. Without --verify, it prints differences, and
-    the exit code is still 0.
+    The replay also repeats the recorded restarts and failures. If an actor could not send a message
+    in the recording because its consumers were busy, it cannot send it in the replay either. The
+    replay publishes nothing. Without --verify, the exit code is 0 even if the command prints
+    differences.
 
       ldo replay recordings/desk --verify
     """

@@ -164,7 +164,7 @@ def run(
 
 
 def print_results(record: RunWriter, out: Path, localize: Path | None) -> None:
-    """Print the summary of a finished run, and notes on what the user may not expect."""
+    """Print the summary of a finished run, with notes on unmerged submaps and on localization."""
     console = Console()
     console.print(summary_table(record.summary, out))
     if record.summary["gaussians_unmerged"]:
@@ -179,8 +179,8 @@ def execute(
     """Run a job with a progress bar.
 
     Args:
-        job: The job.
-        go: `run_offline` or `run_realtime`.
+        job: Sequence, folder and options of the run.
+        go: Function that runs the job: `run_offline` or `run_realtime`.
         console: Console of the progress bar.
 
     Raises:
@@ -191,8 +191,8 @@ def execute(
             return go(job, advance)
         except OSError as error:
             raise ConfigError(
-                f"{job.folder} cannot be written: {error.strerror}. Free some space, or choose "
-                "another folder; the files in this one are incomplete."
+                f"{job.folder} cannot be written: {error.strerror}. The files in this "
+                "folder are incomplete. Free some space, or choose another folder."
             ) from error
 
 
@@ -258,7 +258,7 @@ def with_options(config: Config, hold_out: int | None, threads: int | None) -> C
 
 
 def require_compatible(options: Mapping[str, object]) -> None:
-    """Check that no options are given that exclude each other (EXCLUSIVE).
+    """Check that no two of the given options exclude each other; see EXCLUSIVE.
 
     Args:
         options: Values of the options by name; a true value means that the option is given.
@@ -279,7 +279,9 @@ def require_separate(localize: Path | None, out: Path, refine: int) -> None:
         ConfigError: The run would refine or replace that map.
     """
     if localize and refine:
-        raise ConfigError("--localize never changes the map. Remove --refine-iterations.")
+        raise ConfigError(
+            "--refine-iterations would change the map of --localize. Remove --refine-iterations."
+        )
     if localize and localize.expanduser().resolve() == out.expanduser().resolve():
         raise ConfigError(f"--out {out} would replace the map of --localize. Choose another --out.")
 

@@ -124,9 +124,9 @@ def record(
     You cannot record a service that already runs, because the recording would lack the state of its
     actors. Stop the service, then run `ldo record` with the same --state folder to keep the map.
 
-    A recording of 640x480 pixels at 30 Hz takes 100 MB per second; recording.max_gb limits the
-    size. `ldo replay DIR --verify` replays the recording. Every verb that takes a SOURCE accepts
-    DIR as a data set.
+    A recording of 640x480 pixels at 30 Hz takes 100 MB per second; the setting recording.max_gb
+    limits the size. `ldo replay DIR --verify` replays the recording. Every command that takes a
+    SOURCE also accepts DIR as SOURCE.
 
       ldo record recordings/desk
       ldo publish synthetic:room --rate 15      (in another terminal)

@@ -47,8 +47,9 @@ def simulate(
 ) -> None:
     """Run all actors on a logical clock, and print a digest of each actor's outputs.
 
-    The digests depend only on the frames, the configuration and the instruction set, not on the
-    number of threads or the load of the machine. The command writes no files.
+    The digests depend only on the frames, the configuration and the instruction set of the CPU.
+    They do not depend on the number of threads or the load of the machine. The command writes no
+    files.
 
       ldo simulate synthetic:room --max-frames 60 --json
     """

@@ -36,13 +36,14 @@ def suite(
     ] = 1,
     overwrite: Overwrite = False,
 ) -> None:
-    """Run and evaluate sequences and variants; print tables with mean and standard deviation.
+    """Run and evaluate several sequences and variants, and print tables of their metrics.
 
-    The command prints the tables in Markdown and writes them to DIR/table.md. If you repeat an
-    interrupted command, finished runs are not repeated. A sequence without data is skipped and
-    marked in the tables. The built-in suites give the tables of the LDO-SLAM paper, its sensitivity
-    analysis and its ablation. `--set` changes a setting in all runs; the suite defines the settings
-    of each variant.
+    The command prints the tables in Markdown and writes them to DIR/table.md. Each result is
+    the mean over the seeds, followed by the standard deviation if there are several seeds. If you
+    repeat an interrupted command, finished runs are not repeated. A sequence without data is
+    skipped and marked in the tables. The built-in suites give the tables of the LDO-SLAM paper, its
+    sensitivity analysis and its ablation. `--set` changes a setting in all runs; the suite defines
+    the settings of each variant.
 
       ldo suite table-1 --data ~/data --out suites/table-1
       ldo suite table-9 --data ~/data --out suites/ablation --set detector.model=nano

@@ -24,10 +24,10 @@ def topics(
     markdown: Annotated[bool, argument(help="print the table of docs/topics.md")] = False,
     mermaid: Annotated[bool, argument(help="print the diagram in Mermaid")] = False,
 ) -> None:
-    """List every topic: its key, message, producer, consumers and their policies.
+    """List every topic with its key, message, producer, and consumers with their queue policies.
 
-    Bodies are MessagePack maps, which any MessagePack library reads. Topics marked * also answer a
-    query with their last value.
+    The body of a message is a MessagePack map, which any MessagePack library reads. Topics marked *
+    also answer a query with their last value.
     """
     if json_schema_:
         print(json.dumps(json_schema(), indent=1))

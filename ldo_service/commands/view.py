@@ -58,7 +58,7 @@ def require_viser() -> None:
         ConfigError: viser is not installed.
     """
     if importlib.util.find_spec("viser") is None:
-        raise ConfigError(f"the window needs viser. Install it by {install_command('viewer')}.")
+        raise ConfigError(f"`ldo view` needs viser. Install it by {install_command('viewer')}.")
 
 
 @contextmanager
@@ -86,7 +86,7 @@ def source_of(
 
 
 def serve_window(source: Source, config: ViewerConfig, title: str) -> None:
-    """Serve the window until the program is interrupted."""
+    """Show the scene in the browser window until the program is interrupted."""
     from ldo_service.viewer.window import open_window  # Viser is an optional extra.
 
     with open_window(source, config, title) as window:

@@ -41,13 +41,13 @@ def load_config(
     Args:
         path: The YAML file; None for no file.
         settings: Settings as `section.field=value`, as on the command line. `preset=NAME` selects a
-            preset, wherever it stands.
+            preset, at any position in the list.
         values: Values of settings by dotted name, such as `{"mapper.iterations": 7}`. The key
             `preset` selects a preset.
 
     Raises:
-        ConfigError: A setting cannot be read, is unknown, has moved, or has an invalid value.
-            Or there is no such preset.
+        ConfigError: The preset does not exist. Or a setting cannot be read, is unknown, belongs to
+            an earlier version, or has an invalid value.
     """
     values = dict(values or {})
     presets: list[object] = [s.partition("=")[2].strip() for s in settings if _is_preset(s)]
@@ -67,10 +67,10 @@ def load_config(
 
 
 def config_of(tree: dict[str, Any]) -> Config:
-    """Return the defaults, changed by a tree of plain values.
+    """Return the defaults, changed by a nested dictionary of settings.
 
     Raises:
-        ConfigError: A setting is unknown, has moved, or has an invalid value.
+        ConfigError: A setting is unknown, belongs to an earlier version, or has an invalid value.
     """
     refuse_moved(tree)
     _check_names(tree, Config, "")
@@ -115,7 +115,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def known_presets() -> dict[str, str]:
-    """Return the description of each preset, the first line of its file, by name."""
+    """Return a description for the name of each preset: the first line of the preset's file."""
     return {
         path.stem: path.read_text().partition("\n")[0].removeprefix("#").strip()
         for path in sorted(PRESETS.glob("*.yaml"))

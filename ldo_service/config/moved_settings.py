@@ -10,13 +10,13 @@ SHOWN = 5  # Maximum number of moved settings in one message; an old file has hu
 
 
 def refuse_moved(tree: dict[str, Any]) -> None:
-    """Check for settings that have been renamed or are now constants.
+    """Check that no setting has been renamed or is now a constant.
 
     Args:
-        tree: Plain values of a file or of the command line.
+        tree: Nested dictionary of the settings in a file or on the command line.
 
     Raises:
-        ConfigError: A setting of an earlier version is used. The message gives the new name of the
+        ConfigError: A setting belongs to an earlier version. The message gives the new name of the
             setting, or the constant that replaces it.
     """
     refusals = [text for path in _leaves(tree, "") if (text := moved(path))]

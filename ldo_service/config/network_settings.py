@@ -74,8 +74,8 @@ class EncoderSettings:
         for prompt in self.prompts:
             if prompt.count("{}") != 1 or prompt.count("{") + prompt.count("}") != 2:
                 raise ConfigError(
-                    f"vlm_labeller.encoder.prompts={list(self.prompts)} must have one {{}} for the "
-                    "name in each prompt."
+                    f"vlm_labeller.encoder.prompts={list(self.prompts)} must contain {{}} once in "
+                    "each prompt, in place of a class name."
                 )
         for name, values in (("image_mean", self.image_mean), ("image_std", self.image_std)):
             if len(values) not in (0, 3):

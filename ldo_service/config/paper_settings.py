@@ -20,7 +20,7 @@ from .values import (
 class PaperSettings:
     """Constants of the LDO-SLAM paper, and switches from the default rules to those of the paper.
 
-    With them, the results of the paper can be reproduced. A user need not tune them.
+    These settings serve to reproduce the results of the paper. Users need not tune them.
     """
 
     # Rule that labels a Gaussian: the fraction of its splat that a region covers, or the

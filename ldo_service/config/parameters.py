@@ -2,7 +2,7 @@
 
 This module and `network_parameters` alone define which parameters a setting determines. Some
 settings determine parameters of several actors. A parameter without a setting keeps the default of
-its class, where a comment gives the reason.
+its class. A comment in that class gives the reason for the default.
 """
 
 from ldo_service.actors.frame_source import FrameSourceConfig
@@ -82,7 +82,7 @@ def actor_parameters(config: Config) -> ActorParameters:
 
 
 def stage_parameters(config: Config) -> SupervisionConfig:
-    """Return the parameters for the supervision of stages."""
+    """Return the parameters for the supervision of actors."""
     supervision = config.supervision
     return SupervisionConfig(
         max_restarts=supervision.max_restarts,

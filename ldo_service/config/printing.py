@@ -65,7 +65,7 @@ def settings_of(config: Config) -> list[Setting]:
 
 
 def section_titles() -> dict[str, str]:
-    """Return the first sentence of the docstring of each section, by its path."""
+    """Return the first sentence of each section's docstring, by the path of the section."""
     return dict(_titles(Config(), ""))
 
 

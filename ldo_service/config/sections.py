@@ -24,7 +24,7 @@ from .tracker_settings import TrackerSettings
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """Root of the configuration; `config.parameters` converts it to parameters of the actors."""
+    """Root of the configuration; the module `parameters` converts it to actor parameters."""
 
     frame_source: FrameSourceSettings = field(default_factory=FrameSourceSettings)
     tracker: TrackerSettings = field(default_factory=TrackerSettings)
@@ -46,8 +46,8 @@ class Config:
         """Check that the service waits long enough for the server of the labeller.
 
         Raises:
-            ConfigError: A timeout of the service is too short. Each must be longer than the
-                deadline of a label request plus the time of one attempt as margin.
+            ConfigError: A timeout of the service is too short. Each timeout must exceed the
+                deadline of a label request plus the time limit of one attempt.
         """
         http = self.vlm_labeller.http
         max_s = http.deadline_s + http.timeout_s  # Deadline of a label, plus one attempt as margin.
@@ -58,16 +58,16 @@ class Config:
         for name, limit_s in limits.items():
             if self.vlm_labeller.url and max_s >= limit_s:
                 raise ConfigError(
-                    f"vlm_labeller.http.deadline_s={http.deadline_s:g} and "
-                    f"vlm_labeller.http.timeout_s={http.timeout_s:g} together must be below "
+                    f"the sum of vlm_labeller.http.deadline_s={http.deadline_s:g} and "
+                    f"vlm_labeller.http.timeout_s={http.timeout_s:g} must be below "
                     f"{name}={limit_s:g}. Raise {name} or lower the other two."
                 )
 
     def with_map_folder(self, folder: Path) -> "Config":
         """Return the configuration with a folder for images and offloaded Gaussians.
 
-        The setting `mapper.image_folder` has priority over the argument. A restored mapper finds
-        its files in the folder.
+        If the setting `mapper.image_folder` is not empty, it has priority over the argument. A
+        restored mapper finds its files in this folder.
 
         Args:
             folder: Folder within the state folder or the run folder.

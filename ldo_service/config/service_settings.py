@@ -34,7 +34,7 @@ class FrameSourceSettings:
 
 @dataclass(frozen=True, slots=True)
 class DatasetSettings:
-    """Data sets: registration of depth (ScanNet, 7-Scenes, bags), and topics of bags."""
+    """Data sets: registration of depth (ScanNet, 7-Scenes, ROS bags), and topics of ROS bags."""
 
     # True registers depth to the color camera. False uses the depth as it is in the files.
     register_depth: bool = False
@@ -111,7 +111,7 @@ class OfflineSettings:
 
 @dataclass(frozen=True, slots=True)
 class ServiceSettings:
-    """Live service (`ldo serve`), and the device that computes map, poses and networks."""
+    """Live service (`ldo serve`), and the device for mapping, tracking and networks."""
 
     # Device of the mapper's optimizer, of the tracker's alignment and of the networks. auto uses a
     # GPU if it passes a self-test, but aligns on the CPU. cuda also aligns on the GPU. Mapping and
@@ -147,7 +147,7 @@ class ServiceSettings:
 
 @dataclass(frozen=True, slots=True)
 class RecordingSettings:
-    """Recordings (`ldo record`); 640x480 at 30 Hz takes 100 MB per second."""
+    """Recordings (`ldo record`); 640x480 pixels at 30 Hz take 100 MB per second."""
 
     # Maximum size of the folder of a recording in GB, at which the recording ends.
     max_gb: PositiveFloat = 50.0

@@ -25,7 +25,7 @@ class MountingSettings:
     """Pose of the camera on the robot: T_base_camera.
 
     The camera has optical axes: x right, y down, z forward. For a base with x forward and z up
-    (REP-103), a camera that looks ahead has the quaternion 0.5 -0.5 0.5 -0.5.
+    (REP-103), a camera that looks ahead has the quaternion 0.5 -0.5 0.5 -0.5 (w x y z).
     """
 
     # Position of the camera in the base frame of the robot, meters.
@@ -62,7 +62,7 @@ class ImageSettings:
 
 @dataclass(frozen=True, slots=True)
 class DepthNoiseSettings:
-    """Axial noise of the depth camera: sigma(z) = floor + growth (z - 0.4 m)^2."""
+    """Axial noise of the depth camera: sigma(z) = floor_m + growth_per_m * (z - 0.4 m)^2."""
 
     # Noise at 0.4 m, meters. The default is that of the Kinect (Nguyen, Izadi and Lovell 2012).
     floor_m: PositiveFloat = advanced(0.0012)

@@ -204,7 +204,7 @@ def crops_from_request(request: LabelRequest) -> list[np.ndarray]:
 
 
 def raw_frame_to_message(raw: RawFrame, compress_depth: bool = True) -> CameraRgbd:
-    """Convert a frame as the camera delivered it to its message.
+    """Convert a raw frame of the camera to its message.
 
     Color stays uncompressed. Depth is compressed by zstd unless `compress_depth` is False.
     """
@@ -227,7 +227,7 @@ def raw_frame_to_message(raw: RawFrame, compress_depth: bool = True) -> CameraRg
 
 
 def raw_frame_from_message(message: CameraRgbd, index: int) -> RawFrame:
-    """Convert a message to the frame as the camera delivered it, decompressed.
+    """Convert a message to a raw frame of the camera, with decompressed images.
 
     Args:
         message: The message.

@@ -1,7 +1,7 @@
 """Conversion of object observations from messages to landmark observations of the pose graph.
 
-This module is separate from `objects`, because it imports gtsam with the pose graph. Most actors
-need `objects` without gtsam.
+This module imports gtsam with the pose graph. Most actors need the module `objects` without gtsam,
+so the two modules are separate.
 """
 
 from collections.abc import Callable

@@ -17,8 +17,8 @@ def loop_closure_to_message(result: LoopCandidateResult) -> LoopClosure:
     """
     if result.closure is None:
         raise ValueError(
-            "a rejected loop candidate has no loop closure to convert: "
-            f"rejected_reason={result.check.rejected_reason!r} must be empty."
+            "the loop candidate has no loop closure, because it was rejected "
+            f"(rejected_reason={result.check.rejected_reason!r}). Convert only accepted candidates."
         )
     return LoopClosure(
         stamp_ns=result.check.proposal.new.stamp_ns,

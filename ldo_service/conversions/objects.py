@@ -127,11 +127,11 @@ def dense_distribution(
 
 
 def map_objects(table: np.ndarray, names: Sequence[str]) -> tuple[MapObject, ...]:
-    """Convert a table of K objects (see `semantics.object_landmarks`) to K messages in this order.
+    """Convert a table of K objects to K messages in the same order.
 
     Args:
-        table: The objects, [K] records.
-        names: Names of the classes.
+        table: The objects, [K] records; see `semantics.object_landmarks`.
+        names: Names of the classes, by index.
     """
     p = distributions(table)
     columns = zip(table, labels_of(table).tolist(), p, entropy(p).tolist(), strict=True)
@@ -164,11 +164,11 @@ def _object_to_message(
 
 
 def landmarks_from_message(message: MapObjects, movable: Collection[str]) -> MapLandmarks:
-    """Return the objects of a message as landmarks of loop closing.
+    """Return the objects of a message as landmarks for loop closing.
 
     Args:
         message: The message.
-        movable: Names of the classes that move by themselves; their objects are left out.
+        movable: Names of the classes that move by themselves; objects of these classes are omitted.
     """
     objects = [one for one in message.objects if one.name not in movable]
     names = sorted({name for one in objects for name, _ in one.distribution} | {"other"})

@@ -130,8 +130,8 @@ def open_sequence(source: str, options: SequenceOptions | None = None) -> Sequen
     Args:
         source: A path, whose layout is detected, or `synthetic[:name]`. Other packages may add
             layouts, see `Layout`.
-        options: Registration of depth to color; None uses the defaults. Options other than the
-            defaults are valid only for layouts with two cameras.
+        options: Registration of depth to color, and topics of ROS bags; None uses the defaults. A
+            layout accepts only the options that apply to it.
 
     Raises:
         DataError: The source does not exist or has no known layout.
@@ -151,7 +151,7 @@ def open_sequence(source: str, options: SequenceOptions | None = None) -> Sequen
     if not path.exists():
         raise DataError(
             f"{source} does not exist. Check the path, or give a built-in scene, such as "
-            "synthetic:room. `ldo run --help` lists them."
+            "synthetic:room. `ldo run --help` lists the scenes."
         )
     if layout := find_layout(path):
         return layout.open_sequence(path, options)
@@ -161,7 +161,7 @@ def open_sequence(source: str, options: SequenceOptions | None = None) -> Sequen
 def find_layout(path: Path) -> Layout | None:
     """Return the layout that a path has, or None if it has none of the known layouts.
 
-    Other packages are loaded only if no layout of this package matches.
+    The layouts of other packages are loaded only if no layout of this package matches.
     """
     for layouts in (lambda: LAYOUTS, registered_layouts):
         for layout in layouts():

@@ -1,18 +1,18 @@
 """Recordings of Azure Kinect and Femto cameras: files .mkv of k4arecorder.
 
-Streams have a title: COLOR (MJPEG, NV12, YUY2 or BGRA) and DEPTH (16-bit gray, big-endian,
-millimeters). The attachment calibration.json has a list CalibrationInformation.Cameras, in which
-the color camera has the location CALIBRATION_CameraLocationPV0 and the depth camera
-CALIBRATION_CameraLocationD0. Each has
+The video streams have the titles COLOR (MJPEG, NV12, YUY2 or BGRA) and DEPTH (16-bit gray,
+big-endian, millimeters). The attachment calibration.json has a list CalibrationInformation.Cameras.
+In this list, the color camera has the location CALIBRATION_CameraLocationPV0, and the depth camera
+has the location CALIBRATION_CameraLocationD0. Each of the two cameras has these values:
 
-    Intrinsics.ModelParameters   cx, cy, fx, fy as fractions of the calibrated image, k1 to k6, two
-                                 numbers that are 0, p2, p1
-    Rt.Rotation, Rt.Translation  transform from the depth camera, by rows, meters
+    Intrinsics.ModelParameters   14 numbers: cx, cy, fx, fy as fractions of the calibrated image;
+                                 k1 to k6; 0, 0; p2, p1
+    Rt.Rotation, Rt.Translation  transform from depth camera to this camera, by rows, meters
 
-The images of a mode are a part of the calibrated image: see `_color_camera` and DEPTH_MODES. Pixel
-centers have integer coordinates in this project, and coordinates such as 0.5 and 1.5 in the
-calibration. Color is averaged to a grid about 640 pixels wide, as for phones, and depth is
-registered to this grid. Infrared images and inertial measurements are not read.
+In each mode of a camera, its images are a part of the calibrated image; see `_color_camera` and
+DEPTH_MODES. Pixel centers have integer coordinates in this project, and coordinates such as 0.5 and
+1.5 in the calibration. Color is averaged to a grid about 640 pixels wide, as for phones, and depth
+is registered to this grid. Infrared images and inertial measurements are not read.
 """
 
 import json
@@ -45,7 +45,7 @@ LOCATION = "CALIBRATION_CameraLocation"
 
 
 class AzureKinectSequence(Sequence):
-    """Recording of an Azure Kinect: color images, each with the nearest depth within 20 ms."""
+    """Recording of an Azure Kinect: color images with the nearest depth image within 20 ms each."""
 
     registration = "reader"
 
@@ -173,7 +173,7 @@ def _rig(calibration: bytes, color: Video, depth: Video, path: Path) -> Rig:
 def _cameras(content: Any) -> list[Any]:
     cameras = content["CalibrationInformation"]["Cameras"]
     if not isinstance(cameras, list):
-        raise TypeError("`Cameras` must be a list")
+        raise TypeError("`CalibrationInformation.Cameras` must be a list")
     return cameras
 
 

@@ -1,12 +1,12 @@
-"""Files of ROS bags, read by rosbags: their topics, and messages in any order.
+"""Files of ROS bags, read with the library rosbags: their topics, and messages in any order.
 
-*.bag            ROS 1, also of RealSense Viewer
-*.mcap *.db3     ROS 2, one file; *.db3 also of RealSense Viewer
-metadata.yaml    ROS 2, the folder of one or several such files
+*.bag            one file of ROS 1; RealSense Viewer writes such files too
+*.mcap *.db3     one file of ROS 2; RealSense Viewer writes *.db3 too
+metadata.yaml    in a folder with one or several files of ROS 2
 
 The readers of rosbags iterate over messages in the order of time. Reading one message would need
 time proportional to the number of messages before it. The classes of this module therefore remember
-where each message is stored, and show the reader only this entry of its index.
+where each message is stored, and restrict the reader to the index entry of the wanted message.
 """
 
 import struct
@@ -33,7 +33,7 @@ REALSENSE_TAIL = 4
 
 
 def is_bag(path: Path) -> bool:
-    """Return whether a file has the suffix of a bag, or a folder contains the files of a bag."""
+    """Return whether a path is a file with the suffix of a bag, or a folder with files of a bag."""
     if path.is_file():
         return path.suffix.lower() in SUFFIXES
     return (path / METADATA).is_file() or any(path.glob("*.db3"))
@@ -83,7 +83,7 @@ class BagFile:
             self.topics = dict(sorted(_topics(reader.connections).items()))
 
     def messages(self, topics: Sequence[Topic], limit: int | None = None) -> list[StoredMessage]:
-        """Return the messages of topics in the order of the file, after reading their headers.
+        """Return the stamps and locations of the messages of topics, in the order of the file.
 
         Args:
             topics: The topics.

@@ -18,7 +18,7 @@ MAX_STATIC = 1000  # Maximum number of messages that are read of a topic with co
 
 
 def readable_messages(bag: BagFile, is_wanted: Callable[[Topic], bool]) -> Iterator[Any]:
-    """Yield the readable ones of the first MAX_STATIC messages of each wanted topic."""
+    """Yield the first MAX_STATIC messages of each wanted topic; skip unreadable messages."""
     for topic in filter(is_wanted, bag.topics.values()):
         for message in bag.messages([topic], MAX_STATIC):
             try:
@@ -44,7 +44,8 @@ def _transform_of(q: Any, t: Any) -> np.ndarray | None:
 def static_transform(bag: BagFile, target: str, source: str) -> np.ndarray | None:
     """Return the transform [4, 4] from the frame `source` to the frame `target`.
 
-    It is a chain of transforms in /tf_static, or None if they do not connect the two frames.
+    The transform is composed from /tf_static. It is None if /tf_static does not connect the two
+    frames.
     """
     edges: dict[str, dict[str, np.ndarray]] = {}
     for message in readable_messages(bag, lambda topic: topic.name == "/tf_static"):
@@ -66,7 +67,7 @@ def static_transform(bag: BagFile, target: str, source: str) -> np.ndarray | Non
 
 
 def odometry_topic(bag: BagFile, given: str) -> Topic | None:
-    """Return the topic of odometry, or None if there is none, or if there are several.
+    """Return the topic with odometry, or None if the bag has none or several of them.
 
     Args:
         bag: The bag.

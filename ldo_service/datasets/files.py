@@ -1,4 +1,4 @@
-"""Readers of files common to several layouts: numbered frames, matrices, intrinsics as JSON."""
+"""File readers that several layouts share: numbered frames, matrices, intrinsics as JSON."""
 
 import json
 import logging
@@ -49,7 +49,7 @@ def inside(folder: Path, name: str) -> Path | None:
 
     Args:
         folder: Folder of the data set.
-        name: Relative path of the file, as a file of the data set lists it.
+        name: Path of the file relative to `folder`, as the data set lists it.
     """
     path = Path(name)
     return None if path.is_absolute() or ".." in path.parts or "\0" in name else folder / path
@@ -256,7 +256,7 @@ def from_opengl(T_world_camera: np.ndarray) -> np.ndarray:
 
 
 def valid_trajectory(stamps_ns: np.ndarray, poses: list[np.ndarray | None]) -> Trajectory | None:
-    """Return a trajectory of the poses that are rigid transforms, or None if no pose is one.
+    """Return the trajectory of all poses that are rigid transforms; None if no pose is rigid.
 
     Args:
         stamps_ns: Stamps, [N] int64, ascending.

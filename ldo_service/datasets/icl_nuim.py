@@ -8,10 +8,10 @@ scene_00_0000.depth           distance from the camera center in meters, as text
 Both:
 livingRoom0.gt.freiburg       or traj0.gt.freiburg, optional: lines of `number tx ty tz qx qy qz qw`
 
-The data set's camera has fy = -480: its y axis points up in the image. The images are upright, so
-they are those of a camera with fy = 480 whose y axis points down. The poses are mirrored at the
-plane y = 0 accordingly: with M = diag(1, -1, 1, 1), T_world_camera becomes M T_world_camera M. This
-turns the left-handed coordinates into right-handed ones. Frame k is at k / 30 s.
+The data set's camera has fy = -480, because its y axis points up in the image. This project uses
+fy = 480 and a y axis that points down. The images are upright and need no change. The poses are
+mirrored at the plane y = 0: with M = diag(1, -1, 1, 1), T_world_camera becomes M T_world_camera M.
+This turns the left-handed coordinates into right-handed ones. Frame k gets the stamp k / 30 s.
 """
 
 from pathlib import Path
@@ -79,7 +79,7 @@ class IclNuimSequence(Sequence):
         """Return the ground-truth trajectory of the file *.gt.freiburg; None if it does not exist.
 
         Raises:
-            DataError: The file is invalid, or there are several.
+            DataError: The file is invalid, or the folder has several such files.
         """
         paths = sorted(self._folder.glob("*.gt.freiburg"))
         if len(paths) > 1:

@@ -1,4 +1,4 @@
-"""Reading of image files; a truncated file is an error instead of a partly gray image."""
+"""Reading of image files; a truncated file raises an error instead of yielding gray pixels."""
 
 from pathlib import Path
 

@@ -2,10 +2,12 @@
 
 image_2/*.png image_3/*.png   rectified images of the left and the right color camera; if they are
                               missing, image_0/ and image_1/ of the gray cameras
-calib.txt                     lines of `P2: 12 numbers`: projection from rectified camera 0, by rows
+calib.txt                     lines of `P2: 12 numbers`: the matrix, by rows, that projects points
+                              in coordinates of rectified camera 0 to the images of camera 2
 times.txt                     seconds, one line per image
-poses.txt                     optional: 12 numbers per image, the first three rows of camera 0 to
-                              world; else ../../poses/NAME.txt, as the benchmark stores it
+poses.txt                     optional: 12 numbers per image, the first three rows of the transform
+                              from camera 0 to world. If this file is missing, the file of the
+                              benchmark is read: ../../poses/NAME.txt, NAME being the folder's name
 
 The benchmark has no depth images. Depth is computed from each stereo pair by semi-global matching
 of OpenCV. The depth is the z coordinate in the left camera. The ground truth is the pose of this
@@ -58,7 +60,7 @@ class KittiSequence(Sequence):
         if not left.keys() & right.keys():
             raise DataError(
                 f"{folder} has {len(left)} images in {names[0]}/ and {len(right)} in {names[1]}/, "
-                "but no two of them have the same number. Download both folders of the benchmark."
+                "but no number occurs in both. Download both folders of the benchmark."
             )
         self._files = pair_by_number(left, right, folder)
         first, second = (int(name[-1]) for name in names)
@@ -97,7 +99,7 @@ class KittiSequence(Sequence):
         return RawFrame(index, stamp_ns, left, depth_m, 1.0, self.raw_camera)
 
     def truth(self) -> Trajectory | None:
-        """Return the ground-truth trajectory of the left camera, or None if there is no file."""
+        """Return the ground-truth trajectory of the left camera; None if it has no poses file."""
         folder = self._folder.resolve()
         paths = folder / "poses.txt", folder.parent.parent / "poses" / f"{folder.name}.txt"
         path = next((path for path in paths if path.is_file()), None)

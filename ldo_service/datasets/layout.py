@@ -19,10 +19,11 @@ ENTRY_POINTS = "ldo.sequences"
 class Layout:
     """Layout of a recording: a folder or a file.
 
-    Layouts of this package are tried first, and any folder with a folder results/ is taken as
-    Replica. Other packages should therefore recognize files or folders of other names.
+    Layouts of this package are tried before those of other packages. For example, this package
+    takes every folder that contains a folder results/ as a sequence of Replica. A layout of another
+    package should therefore use other names of files and folders.
 
-    Example of a package that adds one, in its pyproject.toml:
+    A package adds a layout by an entry point in its pyproject.toml, such as:
 
         [project.entry-points."ldo.sequences"]
         my_rig = "my_package:LAYOUT"
@@ -30,10 +31,10 @@ class Layout:
     Attributes:
         name: Name of the layout, such as "TUM RGB-D".
         files: Files that a recording has, as a text for error messages.
-        matches: Returns whether a path, which exists, has the layout. It looks at names of files,
-            or at the first bytes of a file.
-        open: Opens a path that matches. It raises DataError if a file is missing or damaged, and
-            ConfigError if the layout does not support the options.
+        matches: Function that returns whether an existing path has the layout. It checks the names
+            of files, or the first bytes of a file.
+        open: Function that opens a path with this layout. It raises DataError if a file is missing
+            or damaged, and ConfigError if the layout does not support the options.
         has_options: True if `open` accepts the options that register the depth to the color
             camera.
         has_topics: True if `open` accepts the options that name topics.
@@ -85,7 +86,8 @@ def registered_layouts() -> tuple[Layout, ...]:
         if not isinstance(layout, Layout):
             raise ConfigError(
                 f"the entry point {point.name} = {point.value} of the group {ENTRY_POINTS} is a "
-                f"{type(layout).__name__}, must be an ldo_service.datasets.Layout."
+                f"{type(layout).__name__}, must be an ldo_service.datasets.Layout. Repair or "
+                "remove its package."
             )
         layouts.append(layout)
     return tuple(layouts)

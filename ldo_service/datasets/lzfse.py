@@ -1,14 +1,14 @@
 """Check of LZFSE streams before they are decompressed, so that a crafted stream cannot fill memory.
 
 A stream is a sequence of blocks. The header of each block declares its decompressed size, but the
-decoder does not enforce this size for compressed blocks. It writes all bytes that the literals and
-matches of the block yield, and the library `pyliblzfse` enlarges its buffer without a limit. This
-module reads only the headers of the blocks, which are little-endian (lzfse_internal.h of
-github.com/lzfse/lzfse):
+decoder does not enforce this size for blocks of type bvx2. The decoder writes all bytes that the
+literals and matches of such a block yield, and the library `pyliblzfse` enlarges its buffer without
+a limit. This module reads only the headers of the blocks, which are little-endian
+(lzfse_internal.h of github.com/lzfse/lzfse):
 
-    bvx-    uint32 bytes; the bytes themselves
-    bvxn    uint32 bytes, uint32 size of the payload; the payload, bounded by the decoder
-    bvx2    uint32 bytes; three uint64 with packed counts; tables; payloads of literals and matches
+    bvx-    uint32 decompressed size; the bytes, not compressed
+    bvxn    uint32 decompressed size, enforced by the decoder; uint32 size of payload; payload
+    bvx2    uint32 decompressed size; three uint64 with packed counts; tables; literals; matches
     bvx$    end of the stream
 """
 
@@ -27,9 +27,9 @@ def decoded_bytes(data: bytes) -> int | None:
     """Compute the decompressed size of a stream from the headers of its blocks.
 
     Returns:
-        The number of bytes. None if the stream is damaged, or if the decoder could write more than
-        MATCH_BYTES / MIN_BYTES_PER_MATCH times the decompressed size that the header of a block
-        declares.
+        The number of bytes; None if the stream is damaged or a block could expand too far. A block
+        could expand too far if the decoder could write more than MATCH_BYTES / MIN_BYTES_PER_MATCH
+        times the size that the header of the block declares.
     """
     total, position = 0, 0
     try:

@@ -1,14 +1,17 @@
 """Sequences in the layout of nerfstudio, as Polycam and `ns-process-data` export them.
 
-transforms.json      fl_x fl_y cx cy [w h] [k1 k2 p1 p2 k3], for all frames or for single ones;
-                     frames: file_path, depth_file_path, and transform_matrix, camera to world with
-                     the axes of OpenGL; optional: camera_model,
-                     depth_unit_scale_factor, meters per unit of depth, default 0.001
-images/ depth/       the files of the frames; depth has the field of view of color, at any size
+transforms.json      JSON with these keys:
+    fl_x fl_y cx cy [w h] [k1 k2 p1 p2 k3]   intrinsics of all frames; a frame may have its own
+    frames                                   list of frames with the keys file_path (color),
+                                             depth_file_path, and transform_matrix (from camera to
+                                             world, camera axes of OpenGL)
+    camera_model                             optional, see CAMERA_MODELS
+    depth_unit_scale_factor                  optional: meters per unit of depth, default 0.001
+images/ depth/       image files; depth has any size, and the same field of view as color
 
-In the file, the principal point is measured from the corner of the image. In this project, it is
-measured from the center of the first pixel. The frames have no stamps; in the order of the file,
-they get stamps at 30 Hz. The poses come from COLMAP or from a phone. They are an estimate, not
+In transforms.json, the principal point is measured from the corner of the image. In this project,
+it is measured from the center of the first pixel. The frames have no stamps, so frame k of the list
+gets the stamp k / 30 s. The poses come from COLMAP or from a phone. They are an estimate, not
 ground truth, so `odometry` returns them and `truth` returns None.
 """
 
@@ -98,7 +101,7 @@ class NerfstudioSequence(Sequence):
         return None
 
     def odometry(self) -> Trajectory | None:
-        """Return the poses of transforms.json, or None if no frame has a valid one."""
+        """Return the poses of transforms.json, or None if no frame has a valid pose."""
         return valid_trajectory(self.stamps_ns, self._poses)
 
 
@@ -152,7 +155,8 @@ def _camera(fields: dict[str, Any], size: tuple[int, int], path: Path) -> Camera
     )
     if k4:
         raise DataError(
-            f"{path}: k4 is {k4:g}, but OpenCV's model has no such term. Undistort the images."
+            f"{path}: k4 is {k4:g}, but only k1, k2, k3, p1 and p2 are supported. Undistort the "
+            "images."
         )
     distortion = [k1, k2, p1, p2, k3] if k3 else [k1, k2, p1, p2]
     fx = number(fields, "fl_x", path)

@@ -2,11 +2,13 @@
 
 color/*.jpg depth/*.png    numbered images of one size; depth in millimeters, registered to color.
                            Redwood names the first folder image/ or rgb/
-camera_intrinsic.json      or intrinsic.json: {"width", "height", "intrinsic_matrix"}, the last with
-                           9 numbers column by column; Redwood has no such file, see REDWOOD_CAMERA
+camera_intrinsic.json      or intrinsic.json: an object with the keys width, height (pixels) and
+                           intrinsic_matrix (9 numbers, column by column). Redwood has no such file;
+                           its camera is REDWOOD_CAMERA
 
-File names of Redwood have the stamp after the number: 0000001-000000033333.jpg. This stamp is not
-read: frame k gets the stamp k / 30 s. The layout has no ground truth, so `truth` returns None.
+File names of Redwood have a stamp after the number: 0000001-000000033333.jpg. This stamp is not
+used; the image with number k gets the stamp k / 30 s. The layout has no ground truth, so `truth`
+returns None.
 """
 
 import logging
@@ -82,9 +84,9 @@ def _redwood_camera(folder: Path, color: list[Path]) -> Camera:
     if (width, height) != (REDWOOD_CAMERA.width, REDWOOD_CAMERA.height):
         raise DataError(
             f"{folder} has no camera_intrinsic.json, and its images have {width}x{height} pixels, "
-            "not 640x480 as those of Redwood. Create camera_intrinsic.json, such as "
+            "not 640x480 like those of Redwood. Create camera_intrinsic.json with the content "
             f'{{"width": {width}, "height": {height}, "intrinsic_matrix": [fx, 0, 0, 0, fy, 0, cx, '
-            "cy, 1]}, column by column."
+            "cy, 1]}; the matrix is stored column by column."
         )
     log.info("%s has no intrinsics; those of Redwood's PrimeSense are used.", folder)
     return REDWOOD_CAMERA

@@ -1,8 +1,9 @@
 """Images of phones on one pixel grid: large color images, small depth images, and confidence.
 
 A phone registers its depth to the color image: both have the same field of view. Color has up to
-1920x1440 pixels, depth 256x192. Both are brought to a grid of about 640 pixels. Color is averaged
-over blocks. Depth is interpolated only where its four neighbors lie on one surface.
+1920x1440 pixels, depth 256x192. Both are resampled to a grid whose longer side has about 640
+pixels. Color is averaged over blocks. Depth is interpolated only where the four neighboring depth
+pixels lie on one surface.
 """
 
 from dataclasses import dataclass
@@ -38,7 +39,7 @@ class PhoneGrid:
 
     @property
     def block(self) -> int:
-        """Side of the blocks of color pixels that become one pixel of the grid."""
+        """Side, in color pixels, of the square block that becomes one pixel of the grid."""
         longer = max(self.color_camera.width, self.color_camera.height)
         return max(1, longer // MIN_LONGER_SIDE)
 
@@ -73,8 +74,8 @@ class PhoneGrid:
             color: Color, [H, W, 3] uint8 RGB, of the size of `color_camera`.
             depth: Depth, [Hd, Wd], registered to color; 0 or NaN where not measured.
             depth_scale: Units of depth per meter.
-            camera: Camera of this frame at the size of `color_camera`; None means that it is
-                `color_camera`. An autofocus changes the focal length from frame to frame.
+            camera: Camera of this frame at the size of `color_camera`, because an autofocus changes
+                the focal length from frame to frame. None uses `color_camera`.
 
         Raises:
             FrameError: An image has a wrong size or type.
@@ -133,7 +134,7 @@ def enlarge_depth(
         depth: Depth, [Hd, Wd], in any unit; 0 or NaN where not measured.
         size: Height and width of the grid, pixels.
         view: Height and width of the depth image's field of view, in pixels of the grid. `size`
-            is this rounded down.
+            is `view` rounded down.
 
     Returns:
         [H, W]. It is `depth` itself if the sizes are equal, else float32 in the same unit.
@@ -158,7 +159,7 @@ def scaled(camera: Camera, width: int, height: int, source: str) -> Camera:
     """Return a camera for images of another size and the same field of view.
 
     Raises:
-        DataError: The aspect ratios differ by more than one pixel.
+        DataError: The two sizes have different aspect ratios, with a tolerance of one pixel.
     """
     x, y = width / camera.width, height / camera.height
     if abs(camera.height * x - height) > 1 and abs(camera.width * y - width) > 1:

@@ -1,8 +1,13 @@
 """Recordings of the app Record3D for iPhones and iPads: a file `.r3d`, which is a ZIP archive.
 
-metadata                 JSON: K (column by column, for w x h), w, h, dw, dh, and fps
-                         or frameTimestamps in seconds; perFrameIntrinsicCoeffs [fx, fy, cx, cy];
-                         poses [qx, qy, qz, qw, x, y, z], camera to world, with the axes of OpenGL
+metadata                 JSON object with these keys:
+    w, h                          width and height that K refers to
+    K                             intrinsic matrix, column by column
+    perFrameIntrinsicCoeffs       optional: [fx, fy, cx, cy] of each frame, instead of K
+    dw, dh                        width and height of depth
+    fps or frameTimestamps        frames per second, or the stamp of each frame in seconds
+    poses                         optional: [qx, qy, qz, qw, x, y, z] of each frame, from camera to
+                                  world, camera axes of OpenGL
 rgbd/0.jpg               color
 rgbd/0.depth             float32 meters, [dh, dw], LZFSE; registered to color; NaN where unknown
 rgbd/0.conf              optional: uint8, [dh, dw], LZFSE, 0 to 2; see MIN_CONFIDENCE
@@ -70,8 +75,8 @@ class Record3DSequence(Sequence):
         numbers = sorted(int(m[1]) for m in found if m and f"rgbd/{m[1]}.jpg" in names)
         if not numbers:
             raise DataError(
-                f"{path} has no rgbd/N.jpg with an rgbd/N.depth. Export the recording again as "
-                ".r3d, with depth."
+                f"{path} has no pair of files rgbd/N.jpg and rgbd/N.depth with an equal number N. "
+                "Export the recording again as .r3d, with depth."
             )
         self._numbers, self._has_confidence = numbers, {k for k in numbers if _conf(k) in names}
         self._depth_shape = _size(metadata, "dh", path), _size(metadata, "dw", path)
@@ -192,9 +197,9 @@ class Record3DSequence(Sequence):
             is_valid = max(map(abs, found)) <= LAST_STAMP_NS and bool(np.all(np.diff(found) > 0))
         if not is_valid:
             raise DataError(
-                f"{self._path}: the metadata need frameTimestamps, a list with one time in seconds "
-                "for each frame, in ascending order, or fps, a positive number. Export the "
-                "recording again."
+                f"{self._path}: the metadata need frameTimestamps or fps. frameTimestamps must be "
+                "an ascending list with one time in seconds for each frame. fps must be a positive "
+                "number. Export the recording again."
             )
         return np.array(found, np.int64)
 

@@ -62,16 +62,16 @@ class Rig:
         return color, depth, depth_scale
 
     def T_world_color(self, T_world_depth: np.ndarray) -> np.ndarray:
-        """Return the poses [..., 4, 4] of the color camera from those of the depth camera."""
+        """Convert poses [..., 4, 4] of the depth camera to poses of the color camera."""
         return T_world_depth @ se3.inverse(self.T_color_depth)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SequenceOptions:
-    """Options for layouts with unregistered depth (ScanNet, 7-Scenes, bags) or topics (bags).
+    """Options for the registration of depth (ScanNet, 7-Scenes, bags) and the topics of bags.
 
     Raises:
-        ConfigError: T_color_depth is not a rigid transform, or a stream of `topics` is unknown.
+        ConfigError: T_color_depth is not a rigid transform, or `topics` has an unknown key.
     """
 
     # True registers depth to the color camera, at the size of the color image.
@@ -102,7 +102,7 @@ class SequenceOptions:
         return not self.register_depth and not self._given()
 
     def over(self, rig: Rig) -> Rig:
-        """Return a copy of `rig`, in which the values of these options replace those of `rig`."""
+        """Return a copy of `rig` with the cameras and the transform that these options give."""
         return replace(rig, **self._given())
 
     def _given(self) -> dict[str, Camera | np.ndarray]:

@@ -1,16 +1,19 @@
 """Sequences in bags of ROS 1 and ROS 2: RGB-D cameras, and recordings of RealSense Viewer.
 
-A bag needs three topics: color images, depth images, and the camera info of color. They are found
-by their types and usual names, or by `SequenceOptions`. The images are sensor_msgs/Image or
-sensor_msgs/CompressedImage. Each color image has the nearest depth image within 20 ms.
+A bag needs three topics: color images, depth images, and the camera info of color. This module
+finds them by their types and usual names. `SequenceOptions.topics` can name the topics of color and
+depth instead. The images are sensor_msgs/Image or sensor_msgs/CompressedImage. A frame has a color
+image and the nearest depth image within 20 ms.
 
 Depth counts as registered to color if both images have the same size and the same viewpoint. The
 viewpoint is the same if the name of the depth topic says so, if the frame_ids are equal, or if the
 transform between them is the identity. Otherwise, this module registers depth to color with the
 camera info of depth and this transform, which it reads from /tf_static or from the topics of
-RealSense Viewer. A topic with nav_msgs/Odometry is the recorded odometry, if /tf_static connects
-its base with the camera. Inertial measurements and moving transforms are not used; `streams` lists
-them.
+RealSense Viewer.
+
+A topic with nav_msgs/Odometry gives the recorded odometry, if /tf_static connects its child frame
+with the camera. Inertial measurements and moving transforms are not used. The attribute `streams`
+of the sequence lists all topics.
 """
 
 import logging
@@ -128,7 +131,7 @@ class RosBagSequence(Sequence):
         """Return the recorded odometry, or None if there is none.
 
         Raises:
-            DataError: /tf_static does not connect its base with the camera.
+            DataError: /tf_static does not connect the child frame of the odometry with the camera.
         """
         if self._odometry is None:
             return None
@@ -290,14 +293,16 @@ def _camera(bag: BagFile, image: Topic) -> Camera:
         infos = [t for t in bag.topics.values() if t.kind == CAMERA_INFO]
         raise DataError(
             f"{bag.path} has no camera info of {image.name}. Expected sensor_msgs/CameraInfo on "
-            f"{folder}/camera_info. {_listed('Its topics of this type', infos)}. Record this topic "
-            "too, or choose other images by --topic."
+            f"{folder}/camera_info. {_listed('Its topics of this type', infos)}. Record the camera "
+            "info too, or choose other images by --topic."
         )
     is_rectified = "rect" in COMPRESSED.sub("", image.name).rpartition("/")[2]
     try:
         found = bag.messages([topic], limit=1)
         if not found:
-            raise DataError("the index lists messages that are not in the file. Copy it again.")
+            raise DataError(
+                "the index lists messages that are not in the file. Copy the bag again."
+            )
         model = camera_model(bag.read(found[0]), is_rectified)
         return Camera.of(structs.asdict(model))
     except (FrameError, DataError) as error:

@@ -49,9 +49,10 @@ class ScanNetSequence(RigSequence):
         if not (folder / "intrinsic").is_dir():
             raise DataError(
                 f"{folder} has color/ and depth/, but neither intrinsic/ (ScanNet) nor "
-                "camera_intrinsic.json (Open3D, Redwood). Create camera_intrinsic.json, such as "
+                "camera_intrinsic.json (Open3D, Redwood). Create camera_intrinsic.json with "
+                "the 3x3 matrix column by column, such as "
                 '{"width": 640, "height": 480, "intrinsic_matrix": [525, 0, 0, 0, 525, 0, 319.5, '
-                "239.5, 1]}, column by column."
+                "239.5, 1]}."
             )
         sizes = first_size(self._files.color), first_size(self._files.depth)
         rig = _rig(folder / "intrinsic", *sizes)

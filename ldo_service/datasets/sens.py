@@ -122,8 +122,8 @@ class SensSequence(RigSequence):
 def _require_bytes(data: bytes, size: int, source: str) -> None:
     if len(data) != size:
         raise FrameError(
-            f"{source} does not have the {size} bytes that its size in pixels needs. Download the "
-            "file again."
+            f"{source} does not have the {size} bytes that the width and height in the header of "
+            "the file require. Download the file again."
         )
 
 
@@ -148,8 +148,9 @@ def _header(file: BinaryIO, path: Path) -> _Header:
     version, name_bytes = struct.unpack("<IQ", _exactly(file, 12, path, "its header"))
     if version != VERSION or name_bytes > MAX_NAME_BYTES:
         raise DataError(
-            f"{path} is not a .sens file of version {VERSION}: its version is {version}, and the "
-            f"name of its sensor has {name_bytes} bytes. Convert it with ScanNet's tools."
+            f"{path} is not a .sens file of version {VERSION}: its version is {version}, and "
+            f"its sensor name has {name_bytes} bytes, expected at most {MAX_NAME_BYTES}. Convert "
+            "the file with ScanNet's tools."
         )
     _exactly(file, name_bytes, path, "its header")
     matrices = MATRICES.unpack(_exactly(file, MATRICES.size, path, "its header"))
@@ -166,7 +167,7 @@ def _header(file: BinaryIO, path: Path) -> _Header:
     if not (is_rigid(T_color) and is_rigid(T_depth)):
         raise DataError(
             f"{path}: the extrinsics of color {T_color.tolist()} and depth {T_depth.tolist()} must "
-            "be rigid transforms. Copy or download it again."
+            "be rigid transforms. Copy or download the file again."
         )
     try:
         cameras = (_camera(K_color, *sizes[:2]), _camera(K_depth, *sizes[2:]))
@@ -196,8 +197,8 @@ def _index(file: BinaryIO, path: Path, frames: int) -> _Index:
     end = path.stat().st_size
     if not 0 < frames <= end // FRAME.size:
         raise DataError(
-            f"{path} has {end} bytes and its header announces {frames} frames, expected 1 to "
-            f"{end // FRAME.size} frames. Copy or download it again."
+            f"{path}: the header announces {frames} frames, but a file of {end} bytes has 1 to "
+            f"{end // FRAME.size} frames. Copy or download the file again."
         )
     poses, stamps_us, offsets, sizes = [], [], [], []
     for k in range(frames):

@@ -9,8 +9,9 @@ The files are unregistered images of a Kinect: color and depth come from cameras
 different focal lengths. By default, frames are read as they are, with the intrinsics of the depth
 camera for both images. Color and depth then disagree by up to about thirty pixels.
 `SequenceOptions.register_depth` registers depth to the color camera instead and transforms the
-poses accordingly. The published calibration covers the depth camera only (585, 585, 320, 240 px).
-The other values of the constant `RIG` are estimates, which `SequenceOptions` can replace.
+poses accordingly. The published calibration covers the depth camera only: fx = fy = 585 px,
+cx = 320 px and cy = 240 px. The other values of the constant `RIG` are estimates, which
+`SequenceOptions` can replace.
 """
 
 from dataclasses import replace

@@ -90,7 +90,7 @@ class StrayScannerSequence(Sequence):
         return None
 
     def odometry(self) -> Trajectory | None:
-        """Return the poses of the phone, or None if no line has one."""
+        """Return the poses of the phone, or None if no line of odometry.csv has a pose."""
         return valid_trajectory(self.stamps_ns, self._poses)
 
 

@@ -145,8 +145,9 @@ def _calibration(folder: Path, color: list[Path]) -> Calibration:
     recording = re.search("|".join(PUBLISHED_CAMERAS), names)
     if recording is None:
         raise DataError(
-            f"{folder} has no camera.json, and its name does not contain freiburg1, 2 or 3 or "
-            f"rgbd_bonn, for which intrinsics are published. Create {path}, such as {CAMERA_JSON}."
+            f"the intrinsics of {folder} are missing: it has no camera.json, and its name contains "
+            "none of freiburg1, freiburg2, freiburg3 and rgbd_bonn (recordings with published "
+            f"intrinsics). Create {path}, such as {CAMERA_JSON}."
         )
     return Calibration(PUBLISHED_CAMERAS[recording[0]], DEPTH_SCALE)
 
@@ -158,7 +159,7 @@ def _pinhole_of_eth3d(path: Path, size: tuple[int, int]) -> Camera:
     except (OSError, ValueError) as error:
         raise DataError(
             f"{path} cannot be read as the four numbers `fx fy cx cy`: {error}. Copy or download "
-            "it again."
+            "the file again."
         ) from error
     try:
         return Camera(*size, fx, fy, cx, cy)

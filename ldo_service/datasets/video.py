@@ -82,7 +82,14 @@ class Video:
         return len(self._stamps)
 
     def read(self, index: int, encoding: str = "rgb24") -> np.ndarray:
-        """Return a frame [H, W, 3] uint8 RGB, or of another encoding of FFmpeg.
+        """Return a frame.
+
+        Args:
+            index: Index of the frame.
+            encoding: Pixel format of the result, by FFmpeg's name.
+
+        Returns:
+            The frame in this pixel format; [H, W, 3] uint8 RGB for "rgb24".
 
         Raises:
             FrameError: The frame cannot be decoded.

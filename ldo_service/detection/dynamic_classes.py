@@ -49,7 +49,7 @@ class Box:
     bottom: float
 
     def in_smaller(self, times: float) -> "Box":
-        """Return the box in an image whose width and height are smaller by the factor `times`."""
+        """Return the box in pixels of an image that is `times` smaller in width and height."""
         edges = (self.left, self.top, self.right, self.bottom)
         return Box(self.label, *(edge / times for edge in edges))
 

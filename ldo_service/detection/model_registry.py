@@ -245,9 +245,10 @@ def open_detector(model: str, config: NetworkConfig) -> OnnxDetector:
         path = Path(model).expanduser()
         if not path.is_file():
             raise ConfigError(
-                f"detector.model={model} is neither `demo`, which comes with the package, nor an "
-                f"ONNX file, nor registered in {models.folder}, which has the models: "
-                f"{', '.join(models.names) or 'none'}. `ldo models add NAME FILE` registers one."
+                f"detector.model={model} is neither `demo` (included in the package) nor an "
+                f"ONNX file, nor registered in {models.folder}. Registered models: "
+                f"{', '.join(models.names) or 'none'}. `ldo models add NAME FILE` registers a "
+                "model."
             )
         return OnnxDetector(path, config)
     found = models.get(model)
@@ -282,9 +283,9 @@ def open_labeller(model: str, config: DualEncoderConfig, names: Sequence[str] = 
         if not any((folder / file).is_file() for file in IMAGES):
             raise ConfigError(
                 f"vlm_labeller.model={model} is neither a folder with {' or '.join(IMAGES)} nor "
-                f"registered in {models.folder}, which has the models: "
+                f"registered in {models.folder}. Registered models: "
                 f"{', '.join(models.names) or 'none'}. "
-                "`ldo models add NAME FILE --embeddings FILE` registers one."
+                "`ldo models add NAME FILE --embeddings FILE` registers a model."
             )
         return DualEncoder(_pair_in(folder), config, names, name=folder.name)
     found = models.get(model)

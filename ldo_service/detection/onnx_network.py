@@ -32,11 +32,12 @@ _SUGAR = re.compile(r"^\[ONNXRuntimeError\] : \d+ : \w+ : (Load model from .*? f
 class Network:
     """Network of an ONNX file, opened in a session of onnxruntime.
 
-    If another device than the CPU fails, or differs from the CPU in its first inference, the
-    inference is repeated on the CPU, which also runs all later ones.
+    The first inference on CUDA is checked: its outputs must agree with those of the CPU. If this
+    check fails, or if a device other than the CPU fails in any inference, the CPU repeats the
+    inference and runs all later ones.
 
     Attributes:
-        has_failed: The CPU replaces another device that was found or asked for.
+        has_failed: True if the CPU replaces another device that was found or requested.
     """
 
     def __init__(self, path: Path, device: str = "cpu", threads: int = 1) -> None:
@@ -122,7 +123,7 @@ class Network:
         return outputs
 
     def metrics(self) -> dict[str, float]:
-        """Return `device_failed`, which is 1 if the CPU replaces another device, and `on_gpu`."""
+        """Return `device_failed` (1: the CPU replaces another device) and `on_gpu` (1: CUDA)."""
         on_gpu = self.providers[0] == CUDA
         return {"device_failed": float(self.has_failed), "on_gpu": float(on_gpu)}
 
@@ -185,7 +186,7 @@ class Network:
                 if output.shape != expected.shape or not np.allclose(
                     output, expected, rtol=TOLERANCE, atol=TOLERANCE
                 ):
-                    raise DeviceError("the outputs of the first inference differ from the CPU.")
+                    raise DeviceError("the outputs of the first inference differ from the CPU's.")
             self._is_tested = True
         return outputs
 
@@ -209,7 +210,9 @@ def sha256(path: Path) -> str:
 
 
 def providers_of(device: str) -> list[str]:
-    """Return the execution providers of a device that this machine has, by preference.
+    """Return the execution providers for a device, the preferred one first.
+
+    Providers that the installed onnxruntime lacks are omitted.
 
     Args:
         device: Setting `service.device`.

@@ -153,8 +153,8 @@ def coco_class(name: str) -> str | None:
 def answers_to(query: str) -> tuple[str, ...]:
     """Return the class names that match a text query, the best match first.
 
-    The first is the query's canonical name. Next is the COCO class that includes the query, if any:
-    a detector may know no narrower class. The last are the subclasses of the query.
+    The first is the query's canonical name. Next is the COCO class that includes the query, if any,
+    because a detector may know only this class. The last are the subclasses of the query.
 
     The answer to "chair" is "chair" and its subclasses such as "armchair"; the answer to "armchair"
     is "armchair" and "chair".
@@ -283,7 +283,7 @@ class LabelSources:
     def undetectable(self) -> np.ndarray | None:
         """Return the labels that only the labeller has given, [256] bool; None if it gave no label.
 
-        The detector does not know these labels, so its silence about such an object is no miss.
+        The detector does not know these labels and cannot miss an object that has one of them.
         """
         if not self.by_labeller:
             return None

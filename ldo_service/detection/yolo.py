@@ -5,7 +5,7 @@ number of boxes therefore determines the layout of the output. As a check, the p
 lie near their cells.
 
             input                          output
-    yolov5  RGB 0..1, centered             [1, 3 cells, 5 + C] cx, cy, w, h, objectness, classes
+    yolov5  RGB 0..1, centered             [1, 3*cells, 5 + C] cx, cy, w, h, objectness, classes
     yolox   BGR 0..255, upper left corner  [1, cells, 5 + C] as yolov5, with offsets and log sizes
     yolov8  RGB 0..1, centered             [1, 4 + C, cells] cx, cy, w, h, classes
 
@@ -14,9 +14,9 @@ of a box is an offset from its cell, and its size is a logarithm; networks expor
 `--decode_in_inference` output pixels, as the other layouts do. YOLOv7 has the layout of YOLOv5.
 YOLOv9 and YOLO11 have the layout of YOLOv8.
 
-An image is scaled to fit into the input of a network (letterbox), and the boxes are scaled back to
-the image. Of overlapping boxes of one class, non-maximum suppression keeps the one with the highest
-score.
+An image is scaled to fit into the input of a network (letterbox). It lies in the center or in the
+upper left corner of the input. The boxes are scaled back to the image. Of overlapping boxes of one
+class, non-maximum suppression keeps the one with the highest score.
 """
 
 from dataclasses import dataclass
@@ -104,7 +104,7 @@ class Head:
     is_decoded: bool  # True: boxes are in pixels; false: offsets from their cells and log sizes.
 
     def candidates(self, output: np.ndarray, score_min: float) -> Candidates:
-        """Return the boxes of an output whose best class has at least the score `score_min`.
+        """Return the boxes whose best class has a score of at least `score_min`.
 
         The score of a class is the product of its output and the objectness. In layouts without
         objectness, it is the output of the class.
@@ -131,8 +131,9 @@ class Head:
         low, high = float(scores.min()), float(scores.max())
         if low < -SCORE_TOLERANCE or high > 1 + SCORE_TOLERANCE:
             raise ModelError(
-                f"with the layout {self.layout.name}, the scores from {low:.3g} to {high:.3g} are "
-                "no probabilities in 0..1: export the network with its final sigmoid."
+                f"with the layout {self.layout.name}, the scores range from {low:.3g} to "
+                f"{high:.3g}, so they are no probabilities in 0..1: export the network with its "
+                "final sigmoid."
             )
         if self.cells_apart(output) > CELLS_APART:
             raise ModelError(
@@ -142,7 +143,10 @@ class Head:
             )
 
     def cells_apart(self, output: np.ndarray) -> float:
-        """Return the median distance of boxes from their cells, in cells; 0 if grid is None."""
+        """Return the median distance of the boxes from the grid cells that predict them.
+
+        The unit is the edge of a grid cell. The result is 0 if the layout has no grid of cells.
+        """
         if self.grid is None:
             return 0.0
         rows = _rows(output, self.layout)
@@ -316,9 +320,10 @@ class Letterbox:
     def to_image(self, boxes: np.ndarray) -> np.ndarray:
         """Convert boxes from the input to the image, and clip them to the image.
 
-        Networks have the origin at the corner of the first pixel, this project has it at the
-        pixel's center. So x_image = (x_input - offset) * W / w - 0.5, where W is the width of the
-        image and w is the width of the scaled image. The image covers -0.5 to W - 0.5.
+        Networks have the origin at the corner of the first pixel. This project has the origin at
+        the center of this pixel. So x_image = (x_input - offset) * W / w - 0.5. Here, W is the
+        width of the image; w is the width and offset the left edge of the scaled image. The image
+        covers -0.5 to W - 0.5.
 
         Args:
             boxes: Boxes in the input, [M, 4], x0 y0 x1 y1, pixels.

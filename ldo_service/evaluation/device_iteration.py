@@ -1,6 +1,6 @@
-"""Times on a GPU beside the CPU, after a comparison of the results.
+"""Benchmark of a GPU and the CPU, which first checks that both give the same results.
 
-An iteration of the Gaussian optimizer and an alignment of the tracker are measured.
+The benchmark times an iteration of the Gaussian optimizer and an image alignment of the tracker.
 """
 
 import time
@@ -33,9 +33,10 @@ class DeviceTimes:
     """Median times by stage in milliseconds, and the peak memory of the GPU.
 
     Attributes:
-        cpu_ms: Times on the CPU. "alignment" is that of a frame of ALIGNED_PX, not of the image.
+        cpu_ms: Times on the CPU. The stage "alignment" always aligns a frame of 320x240 pixels
+            (`ALIGNED_PX`); the other stages use the size of the training image.
         gpu_ms: Times on the GPU. The host waits for the GPU at the end of each stage.
-        gpu_mb: Largest memory that arrays took on the GPU, MB; 0 in the interpreter of Triton.
+        gpu_mb: Peak memory of the arrays on the GPU, MB; 0 if Triton runs in its interpreter.
     """
 
     cpu_ms: dict[str, float]
@@ -53,16 +54,16 @@ def device_times(
     self_test_repeats: int = 20,
     clock: Callable[[], float] = time.perf_counter,
 ) -> DeviceTimes:
-    """Measure an iteration and an alignment on both devices, if their results agree.
+    """Measure an optimizer iteration and a frame alignment on GPU and CPU if their results agree.
 
     Args:
-        arrays: Arrays of the GPU.
+        arrays: Array operations of the GPU.
         n: Number of Gaussians in front of the camera.
-        camera: Camera of the image.
-        repeats: Iterations; the times are medians over them.
-        threads: Threads of the CPU.
-        self_test_repeats: Repetitions of the self-test.
-        clock: Clock in seconds.
+        camera: Camera of the training image.
+        repeats: Number of measurements of each stage; the results are their medians.
+        threads: Number of CPU threads.
+        self_test_repeats: Number of repetitions of the self-test.
+        clock: Function that returns the time in seconds.
 
     Raises:
         DeviceError: The GPU fails, or its results differ from those of the CPU.
@@ -80,9 +81,9 @@ def device_times(
         require_equal(got, wanted)
     except DeviceError as error:
         raise DeviceError(
-            f"at {camera.width}x{camera.height} pixels with {n} Gaussians, an iteration on the GPU "
-            f"differs from one on the CPU: {error} No times are measured. Map on the CPU "
-            "(`service.device=cpu`), and report the GPU and its driver."
+            "the GPU failed or differed from the CPU in an iteration of the Gaussian optimizer at "
+            f"{camera.width}x{camera.height} pixels with {n} Gaussians: {error} No times were "
+            "measured. Use the CPU (`service.device=cpu`), and report the GPU model and its driver."
         ) from error
     steps = []
     for make in makers:
@@ -97,9 +98,9 @@ def device_times(
 
 
 def stages(backend: OptimizerBackend, view: TrainingView) -> Steps:
-    """Return the stages of an iteration as functions by name.
+    """Return the stages of an optimizer iteration as functions by name.
 
-    Each stage ends with a download, so that its time includes all work of the GPU.
+    Each stage ends with a download from the GPU, so that its time includes all work of the GPU.
     """
 
     def rendering() -> None:
@@ -113,7 +114,7 @@ def stages(backend: OptimizerBackend, view: TrainingView) -> Steps:
 
 
 def alignment_steps(arrays: Arrays) -> list[Steps]:
-    """Return the alignment of a new frame to known points, on the CPU and on the GPU.
+    """Return functions that align a new frame to known points: on the CPU, then on the GPU.
 
     Raises:
         DeviceError: The results of the GPU differ from those of the CPU.
@@ -136,5 +137,5 @@ def alignment_steps(arrays: Arrays) -> list[Steps]:
 
 
 def with_sum(times_ms: dict[str, float]) -> dict[str, float]:
-    """Return times by stage, with their sum as the time of the iteration."""
+    """Return the times by stage, and their sum under the key "iteration"."""
     return {**times_ms, "iteration": sum(times_ms.values())}

@@ -1,4 +1,4 @@
-"""Data of a finished run for evaluation; `ldo_service.runs.finished` reads them from a folder."""
+"""Data of a finished run for evaluation; `ldo_service.runs.finished` reads the run folder."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -25,7 +25,7 @@ MAX_MOTION_INTERVAL_S = 0.3
 
 @dataclass(frozen=True, slots=True)
 class RunFrame:
-    """A tracked frame of a run."""
+    """Frame that the tracker processed in a run, with its tracking status."""
 
     index: int  # Index in the sequence.
     stamp_ns: int
@@ -40,7 +40,7 @@ class RunFrame:
 
 @dataclass(frozen=True, slots=True)
 class FrameCounts:
-    """Numbers of tracked frames of a run: all, those with a pose, and those with status OK."""
+    """Frame counts of a run: all tracked frames, frames with a pose, and frames with status OK."""
 
     frames: int
     with_pose: int  # Frames with a pose in the map; frames of unmerged submaps have none.
@@ -61,7 +61,7 @@ class Exposures:
     """Exposures of the keyframes.
 
     Attributes:
-        stamps_ns: Stamps of the keyframes, [K], ascending.
+        stamps_ns: Stamps of the K keyframes, [K], nanoseconds, ascending.
         matrices: Gains (row 0) and biases (row 1) of the three color channels, [K, 2, 3].
     """
 
@@ -92,10 +92,11 @@ class PosedMap:
         name: "online" for the map at the end of the run, "refined" for the map after further
             optimization.
         rows: Gaussians, [N, 16] (see `gaussians.rows`).
-        trajectory: T_map_camera of the frames that are not LOST.
+        trajectory: Poses T_map_camera of the frames that are not LOST.
         exposures: Exposures of the keyframes.
         semantics: Labels of the Gaussians; None without a detector.
-        corrections: Corrections of the camera that were applied to the keyframes.
+        corrections: Corrections of vignetting, depth bias and rolling shutter of the camera, as
+            applied to the keyframes.
     """
 
     name: str
@@ -106,7 +107,7 @@ class PosedMap:
     corrections: CorrectionHistory = field(default_factory=CorrectionHistory)
 
     def T_map_camera(self, frame: RunFrame) -> np.ndarray:
-        """Return T_map_camera of a frame, [4, 4].
+        """Return the pose of a frame, the transform from the camera to the map, [4, 4].
 
         Raises:
             DataError: If the trajectory has no pose for the frame.
@@ -115,7 +116,7 @@ class PosedMap:
         if len(gaps_s) == 0 or gaps_s.min() > STAMP_TOLERANCE_S:
             raise DataError(
                 f"the {self.name} trajectory has no pose for frame {frame.index}, which has status "
-                f"{frame.status} in frames.csv: the folder is incomplete. Repeat the run."
+                f"{frame.status} in frames.csv: the run folder is incomplete. Repeat the run."
             )
         return self.trajectory.T_world_camera[gaps_s.argmin()]
 
@@ -123,8 +124,8 @@ class PosedMap:
         """Compute the motion of the camera during a frame from the frames before and after it.
 
         Returns:
-            The motion. None if one of the two frames is missing, if they are too far apart in time,
-            if the motion is implausible, or if the shutter has no known delays.
+            The motion. None if one of the two neighboring frames is missing, if they are more than
+            0.3 s apart, if the motion is implausible, or if no shutter timing is known.
         """
         timing = self.corrections.at(frame.stamp_ns).timing
         stamps_s = self.trajectory.stamps_s
@@ -157,7 +158,7 @@ class FinishedRun:
     keyframes: Mapping[int, int] = field(default_factory=dict)
 
     def frame(self, index: int) -> RunFrame:
-        """Return the frame with an index in the sequence."""
+        """Return the frame that has this index in the sequence."""
         return next(frame for frame in self.frames if frame.index == index)
 
     def counts(self) -> FrameCounts:
@@ -167,7 +168,7 @@ class FinishedRun:
         return FrameCounts(len(self.frames), len(final.stamps_s), len(ok.stamps_s))
 
     def stamps_s(self, status: str) -> np.ndarray:
-        """Return the stamps of all frames with the given tracking status, [M] s, ascending."""
+        """Return the stamps of all frames with this tracking status, [M], seconds, ascending."""
         return np.array([f.stamp_ns * 1e-9 for f in self.frames if f.status == status])
 
     def require_source(self, sequence: Sequence) -> None:
@@ -180,18 +181,18 @@ class FinishedRun:
             is_there = 0 <= frame.index < len(sequence)
             if not is_there or sequence.stamps_ns[frame.index] != frame.stamp_ns:
                 raise DataError(
-                    f"the run has frame {frame.index} with the stamp {frame.stamp_ns} ns, but "
-                    f"{sequence.name} has no frame with this number and stamp. Give the SOURCE of "
-                    "the run."
+                    f"frame {frame.index} of the run has the stamp {frame.stamp_ns} ns, but "
+                    f"{sequence.name} has no frame with this index and stamp. Give the SOURCE of "
+                    "the run: the source that the run processed."
                 )
 
 
 def at_stamps(trajectory: Trajectory, stamps_s: np.ndarray) -> Trajectory:
-    """Select the poses of a trajectory at some stamps.
+    """Return the poses of a trajectory that have one of the given stamps.
 
     Args:
         trajectory: The trajectory.
-        stamps_s: Stamps to select, [M], ascending.
+        stamps_s: Stamps to select, [M], seconds, ascending.
     """
     if len(stamps_s) == 0:
         return Trajectory(trajectory.stamps_s[:0], trajectory.T_world_camera[:0])

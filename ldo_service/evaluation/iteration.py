@@ -23,15 +23,16 @@ _WEIGHTS = LossWeights(l1=0.8, d_ssim=0.2, depth=1.0)
 
 
 def bench_camera(width: int, height: int) -> Camera:
-    """Return a camera with a field of view of about 63 degrees, as RGB-D cameras have."""
+    """Return a camera with a horizontal field of view of about 63 degrees, like RGB-D cameras."""
     return Camera(width, height, 0.82 * width, 0.82 * width, (width - 1) / 2, (height - 1) / 2)
 
 
 def walls(n: int, camera: Camera, seed: int = 0) -> np.ndarray:
     """Return flat Gaussians, rows [n, 16], on the walls of a room around the camera.
 
-    The Gaussians are sorted by the image row of their centers. A Gaussian covers about W H / n
-    pixels of the image. In an image with the aspect ratio 4:3, 14 % of the centers lie outside.
+    The Gaussians are sorted by the image row of their centers. Each Gaussian covers about the
+    fraction 1/n of the image. If the aspect ratio is 4:3, 14 % of the centers lie outside of the
+    image.
     """
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(-0.65, 0.65, n), np.sort(rng.uniform(-0.5, 0.5, n))
@@ -48,7 +49,7 @@ def walls(n: int, camera: Camera, seed: int = 0) -> np.ndarray:
 
 
 def noise_frame(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return a frame of noise: color [3, H, W] uint8 and depth [H, W] in meters, with holes."""
+    """Return random color [3, H, W] uint8 and random depth [H, W] in meters, 0 where unknown."""
     rng = np.random.default_rng(1)
     depth_m = rng.uniform(1, 4, (camera.height, camera.width)).astype(np.float32)
     depth_m[rng.uniform(size=depth_m.shape) < 0.2] = 0
@@ -56,13 +57,13 @@ def noise_frame(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Iteration:
-    """Steps of an iteration for one training image, as `GaussianOptimizer.step` runs them.
+    """Optimizer iteration on one training image, split into the steps of `GaussianOptimizer.step`.
 
     Args:
         n: Number of Gaussians in front of the camera.
-        camera: Camera of the image.
-        threads: Threads of the kernels.
-        elsewhere: Number of additional Gaussians in other directions, outside of the image.
+        camera: Camera of the training image.
+        threads: Number of threads of the kernels.
+        elsewhere: Number of additional Gaussians outside of the image, in other directions.
     """
 
     def __init__(self, n: int, camera: Camera, *, threads: int = 1, elsewhere: int = 0) -> None:
@@ -79,7 +80,7 @@ class Iteration:
         self._by_planes = np.empty_like(self._planes)
 
     def forward(self) -> np.ndarray:
-        """Render the planes [5, H, W] of the image: color, weighted depth and opacity."""
+        """Render color (3 planes), weighted depth and opacity of the image, [5, H, W]."""
         self._planes = self._rasterizer.render(
             self.gaussians.rows, self.camera, np.eye(4), bounds=self.gaussians.bounds
         )
@@ -92,14 +93,14 @@ class Iteration:
         return self._by_planes
 
     def backward(self) -> RowGradients:
-        """Compute the derivatives of the loss with respect to rows and pose; Adam takes no step."""
+        """Compute the loss derivatives with respect to Gaussians and camera pose, without Adam."""
         return self._rasterizer.gradients(self._by_planes)
 
     def descent(self) -> VisibleGaussians:
         """Compute the same derivatives as `backward`, and take a step of Adam in the same pass.
 
         Returns:
-            The Gaussians that contribute to the image, which the step changed.
+            The Gaussians that contribute to the image. The step changed these Gaussians.
         """
         return self._adam.step_fused(self.gaussians, self._rasterizer, self._by_planes, rate=0.1)
 
@@ -112,8 +113,8 @@ class Iteration:
 class IterationTimes:
     """Median times of the steps of an iteration in milliseconds.
 
-    The step of Adam runs inside the backward pass. `adam_ms` is the time that the step adds to the
-    backward pass.
+    Adam updates the Gaussians inside the backward pass. `adam_ms` is the time that this update adds
+    to the backward pass.
     """
 
     forward_ms: float
@@ -142,11 +143,16 @@ def iteration_times(
 def medians_ms(
     runs: Sequence[Steps], repeats: int, clock: Callable[[], float] = time.perf_counter
 ) -> list[dict[str, float]]:
-    """Measure the median time of each step in milliseconds.
+    """Measure the median time of each step of each run in milliseconds.
 
-    The runs are measured in alternation, after one round of warm-up, so that other load on the
-    machine affects all of them equally. For a run with the step "descent", the result also has the
-    time of the whole iteration.
+    The runs take turns in every repetition, so that other load on the machine affects all runs
+    equally. One repetition for warm-up comes first and does not count. If a run has the step
+    "descent", its result also has the key "iteration" with the time of the whole iteration.
+
+    Args:
+        runs: Runs to compare; each is a dictionary of functions by the name of the step.
+        repeats: Number of repetitions.
+        clock: Function that returns the time in seconds.
     """
     times: list[dict[str, list[float]]] = [{name: [] for name in steps} for steps in runs]
     for _ in range(repeats + 1):

@@ -1,4 +1,4 @@
-"""Lists of label names for evaluation, and mappings from labels of data sets and maps to them."""
+"""Lists of label names for evaluation, and tables that convert labels to list indices."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ class LabelSet:
     def of_truth(self, class_names: Sequence[str]) -> np.ndarray:
         """Return a table from class ids of the data set to indices in the list, [256] uint8.
 
-        Ignored classes map to VOID.
+        Classes that the evaluation ignores get the index VOID (255).
         """
         table = np.full(256, VOID, np.uint8)
         for class_id, name in enumerate(class_names):
@@ -44,7 +44,7 @@ class LabelSet:
     def of_map(self, names: Sequence[str]) -> np.ndarray:
         """Return a table from labels of the map to indices in the list, [256] uint8.
 
-        Labels whose name is not in the list map to UNKNOWN.
+        Labels whose name is not in the list get the index UNKNOWN (254).
         """
         table = np.full(256, UNKNOWN, np.uint8)
         for label, name in enumerate(names):
@@ -56,9 +56,9 @@ class LabelSet:
 def coco_list(class_names: Iterable[str]) -> LabelSet:
     """Return a list of names: background, then the COCO classes that a data set contains.
 
-    The table of synonyms maps names of the data set to COCO classes. Names without a COCO class map
-    to background. The map's label `other`, for an object without a known name, is not in the list
-    and therefore always wrong.
+    A table of synonyms converts names of the data set to COCO classes. Names without a COCO class
+    become background. The map labels an object without a known name as `other`. This label is not
+    in the list and therefore always counts as wrong.
 
     Args:
         class_names: Names of the classes of the data set.
@@ -89,9 +89,9 @@ def full_list(class_names: Iterable[str]) -> LabelSet:
 
 
 def object_labels(map_names: Sequence[str]) -> np.ndarray:
-    """Return a table [256] uint8 from labels of a map to object labels.
+    """Return a table [256] uint8 that replaces the labels of building parts in a map by background.
 
-    Labels of building parts, such as walls, become background. All other labels stay unchanged.
+    Building parts are walls, floors and ceilings. All other labels stay unchanged.
     """
     table = np.arange(256, dtype=np.uint8)
     table[[k for k, name in enumerate(map_names) if object_name(name) == BACKGROUND]] = 0
@@ -104,10 +104,10 @@ def is_void(name: str) -> bool:
 
 
 def object_name(name: str) -> str:
-    """Map a label name to the corresponding name of a full list, see `full_list`.
+    """Return the name that stands for a label name in the list of `full_list`.
 
-    Parts of the building, such as wall, map to background. Any other name maps to its COCO class,
-    or to its canonical form if there is no such class.
+    The name of a building part, such as wall, becomes background. Any other name becomes the name
+    of its COCO class. A name without a COCO class becomes its canonical form.
     """
     plain = canonical(name)
     return BACKGROUND if plain in BUILDING else coco_class(plain) or plain

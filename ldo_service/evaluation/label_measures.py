@@ -1,4 +1,4 @@
-"""Measures of labels against ground truth: confusion, view agreement, open-vocabulary names."""
+"""Scores of labels: confusion matrix, agreement between views, and names without a COCO class."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -42,9 +42,9 @@ class Agreement:
 
     @property
     def share(self) -> float:
-        """Fraction of the pixels in `objects` that agree; NaN if `objects` is 0.
+        """Fraction of the pixel pairs that have equal labels; NaN if there are no pairs.
 
-        Pixels that show background in both images are excluded, because most of them agree.
+        Pairs that show background in both views are excluded, because most of them agree.
         """
         return self.same / self.objects if self.objects else float("nan")
 
@@ -77,11 +77,13 @@ def correspondences(
 
 
 def agreement(first: np.ndarray, second: np.ndarray, pixels: Correspondences) -> Agreement:
-    """Count the pairs of pixels of which at least one shows an object, and those of equal labels.
+    """Count pairs of corresponding pixels, and the pairs among them with equal labels.
+
+    A pair counts only if at least one of its two pixels shows an object.
 
     Args:
         first: Labels of the first view, [H, W]; 0 is background.
-        second: Labels of the second view, [H, W].
+        second: Labels of the second view, [H, W]; 0 is background.
         pixels: Corresponding pixels of the views.
     """
     here, there = first.ravel()[pixels.first], second.ravel()[pixels.second]
@@ -91,9 +93,10 @@ def agreement(first: np.ndarray, second: np.ndarray, pixels: Correspondences) ->
 
 @dataclass(frozen=True, slots=True)
 class DetectionCounts:
-    """Recall and precision of the names in a map, with the counts that they are computed from.
+    """Recall and precision of the names in a map, and the counts behind these scores.
 
-    The three counts are either all of objects or all of pixels.
+    The counts are either numbers of objects or numbers of pixels: `wanted` have a name in the
+    ground truth, `named` have a name in the map, and `right` have the same name in both.
     """
 
     right: int = 0  # Named correctly in the map.
@@ -107,21 +110,22 @@ class DetectionCounts:
 
     @property
     def recall(self) -> float:
-        """Fraction of `wanted` that is right; NaN if `wanted` is 0."""
+        """Fraction of the true names that the map has right; NaN if there are no true names."""
         return self.right / self.wanted if self.wanted else float("nan")
 
     @property
     def precision(self) -> float:
-        """Fraction of `named` that is right; NaN if `named` is 0."""
+        """Fraction of the map's names that are right; NaN if the map has no names."""
         return self.right / self.named if self.named else float("nan")
 
 
 class OpenNames:
-    """Scores of names without a COCO class, over pixels and over objects, summed view by view.
+    """Recall and precision of names without a COCO class, for pixels and for objects of all views.
 
-    An object is an instance of the data set. The map's name of an object is the name of most of the
-    object's pixels, over all views in which the object fills at least 0.5 % of the image. Parts of
-    the building count as objects here, because the map may give a wall the name of an object.
+    An object is an instance in the ground truth of the data set. The map's name for an object is
+    the name of most of the object's pixels. A view in which the object fills less than 0.5 % of the
+    image does not contribute to this name. Parts of the building count as objects here, because the
+    map may give a wall the name of an object.
     """
 
     def __init__(self, labels: LabelSet, map_names: Sequence[str]) -> None:
@@ -140,13 +144,13 @@ class OpenNames:
         self._truth: dict[int, int] = {}  # True index in the list, by instance id.
 
     def add(self, frame: FrameLabels, truth: np.ndarray, shown: np.ndarray) -> None:
-        """Add a view.
+        """Add the pixels and the objects of a view to the scores.
 
         Args:
             frame: Ground-truth labels of the view.
-            truth: Index of the true name in `labels`, the list given to the constructor, or VOID,
-                [H, W] uint8.
-            shown: Labels of the map, [H, W] uint8.
+            truth: Index of each pixel's true name in the `labels` of the constructor, [H, W] uint8;
+                VOID where the ground truth is ignored.
+            shown: Labels of the map, rendered in this view, [H, W] uint8.
         """
         self._add_pixels(truth, shown)
         sizes = np.bincount(frame.instance_ids.ravel())
@@ -168,7 +172,7 @@ class OpenNames:
 
     @property
     def objects(self) -> DetectionCounts:
-        """The scores of objects over all views."""
+        """Counts of the objects over all added views."""
         called = {instance: int(votes.argmax()) for instance, votes in self._votes.items()}
         named = [instance for instance, label in called.items() if self._is_named[label]]
         right = [i for i in named if self._of_map[called[i]] == self._truth[i]]
@@ -193,7 +197,7 @@ def _table(names: Sequence[str]) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class Segmentation:
-    """Segmentation metrics, 0..1; NaN if no pixel is evaluated; see `segmentation`."""
+    """Metrics that `segmentation` computes, 0..1; NaN if no pixel is evaluated."""
 
     classes: int  # Number of evaluated classes.
     pixel_accuracy: float  # Fraction of the pixels with ground truth that have the right label.
@@ -214,8 +218,8 @@ def confusion(truth: np.ndarray, shown: np.ndarray, classes: int) -> np.ndarray:
 
     Args:
         truth: Index of the true name in a list of C names, [H, W] uint8; VOID is ignored.
-        shown: Index in that list of the name that the map shows, [H, W] uint8; values from C on
-            are unknown names.
+        shown: Index of the map's name in the same list, [H, W] uint8; any value >= C stands for an
+            unknown name.
         classes: Number of names, C.
 
     Returns:
@@ -231,20 +235,21 @@ def confusion(truth: np.ndarray, shown: np.ndarray, classes: int) -> np.ndarray:
 def segmentation(counts: np.ndarray, gate: float = 0.0) -> Segmentation:
     """Return the metrics of a confusion matrix.
 
+    For each class, `true` is the number of its pixels in the ground truth, `shown` is the number of
+    its pixels in the map, and `right` is the number of its pixels in both:
+
         accuracy = right / true,  IoU = right / (true + shown - right)
 
-    for each class, with `true` pixels of the class in the ground truth, `shown` pixels with the
-    label of the class in the map, and `right` pixels in both. The means are over the classes that
-    have more than the fraction `gate` of the true pixels. Pixels with an unknown name in the map
-    are wrong. Pixel accuracy, mean accuracy, mean IoU and frequency-weighted IoU are those of Long
-    et al., CVPR 2015, section 5.
+    A mean over classes includes each class that has more than the fraction `gate` of all true
+    pixels. Pixels with an unknown name in the map count as wrong. Long et al., CVPR 2015,
+    section 5, define pixel accuracy, mean accuracy, mean IoU and frequency-weighted IoU.
 
     Args:
         counts: Number of pixels by true class and by class in the map, [C, C + 1], as `confusion`
             returns it. Class 0 is background; the last column is for unknown names in the map.
-        gate: Minimum fraction of the true pixels, 0..1, of a class in the means.
+        gate: A class enters the means if its fraction of all true pixels exceeds this value, 0..1.
 
-    Example: a cup has two pixels, of which one is found, and one pixel of the wall is labelled cup.
+    Example: The map labels one of the two pixels of a cup, and one pixel of the wall, as cup.
 
     >>> found = segmentation(np.array([[7, 1, 0], [1, 1, 0]]))
     >>> found.pixel_accuracy, round(found.mean_iou, 3), round(found.object_iou, 3)
@@ -266,7 +271,7 @@ def segmentation(counts: np.ndarray, gate: float = 0.0) -> Segmentation:
 
 
 def class_ious(counts: np.ndarray) -> np.ndarray:
-    """Return the IoU of each class, [C]; NaN if a class is neither in ground truth nor map.
+    """Return the IoU of each class, [C]; NaN if neither ground truth nor map has the class.
 
     Args:
         counts: Number of pixels by true class (row) and by class in the map (column), [C, C + 1],

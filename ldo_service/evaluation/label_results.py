@@ -1,4 +1,4 @@
-"""Results of label evaluation: frames to show, values for JSON and a contact sheet."""
+"""Output of the label evaluation: a contact sheet of chosen frames, and values for JSON."""
 
 import colorsys
 from collections import abc
@@ -50,7 +50,7 @@ def label_sheet(
 ) -> np.ndarray:
     """Draw a row [camera, truth, map, error] per picture, and a legend of the names that occur.
 
-    Pixels of background show the camera image in gray.
+    Background pixels show the camera image in gray.
 
     Args:
         pictures: Views to draw.
@@ -94,8 +94,8 @@ def _pictures(
 def label_colors(indices: abc.Sequence[int]) -> np.ndarray:
     """Return a color table [256, 3] uint8 with different colors for the given label indices.
 
-    From one index to the next, the hue advances by the golden ratio and the shade is the next of
-    SHADES.
+    From one index to the next, the hue advances by the golden ratio of a full turn, and the shade
+    advances by one entry of `SHADES`.
     """
     colors = np.zeros((256, 3), np.uint8)
     for place, index in enumerate(indices):
@@ -124,7 +124,7 @@ def painted(color: np.ndarray, labels: np.ndarray, colors: np.ndarray) -> np.nda
 def error_colors(
     color: np.ndarray, truth: np.ndarray, shown: np.ndarray, labels: LabelSet
 ) -> np.ndarray:
-    """Draw each kind of label error in its color; `ERRORS` lists kinds and colors.
+    """Draw each kind of label error in its own color; `ERRORS` lists the kinds and their colors.
 
     Pixels are gray where both label images have background, and black where the ground truth is
     void.
@@ -133,7 +133,7 @@ def error_colors(
         color: Camera image, RGB [H, W, 3] uint8.
         truth: Indices of the true names in `labels`, [H, W] uint8.
         shown: Indices of the map's names in `labels`, [H, W] uint8.
-        labels: Names of the labels.
+        labels: List of label names to which the indices refer.
 
     Returns:
         The picture, RGB [H, W, 3] uint8.
@@ -164,7 +164,7 @@ def _color(rgb: np.ndarray) -> Color:
 def sheet_of_labels(
     run: FinishedRun, sequence: Sequence, errors: LabelErrors, threads: int = 1
 ) -> np.ndarray | None:
-    """Draw the contact sheet of some frames, including those with most and fewest label errors.
+    """Draw the contact sheet of some frames, including the frames with most and fewest errors.
 
     Returns:
         The sheet, RGB [H, W, 3] uint8. None if the source has no true labels, or if no frame has
@@ -187,11 +187,11 @@ def sheet_of_labels(
 def frames_to_show(errors: ListErrors, count: int = VIEWS) -> list[tuple[int, str]]:
     """Choose frames with objects for the contact sheet, spread from the worst to the best.
 
-    Frames are ranked by the fraction of their object pixels with the right label. Frames in which
-    at most the fraction MIN_OBJECTS of the pixels show an object are not chosen.
+    Frames are ranked by the fraction of their object pixels that have the right label. A frame is
+    a candidate only if more than the fraction MIN_OBJECTS of its pixels are object pixels.
 
     Args:
-        errors: Errors of the labels, for the names by which the frames are ranked.
+        errors: Label errors for one list of names; the ranking uses these errors.
         count: Number of frames.
 
     Returns:
@@ -210,7 +210,7 @@ def frames_to_show(errors: ListErrors, count: int = VIEWS) -> list[tuple[int, st
 
 
 def plain_labels(errors: LabelErrors) -> dict[str, Any]:
-    """Return the errors as values for JSON; numbers that are not finite become null."""
+    """Return the label errors as values for JSON; numbers that are not finite become null."""
     return {
         "map": errors.map,
         "frames": list(errors.lists[0].frames),

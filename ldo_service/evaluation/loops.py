@@ -1,4 +1,7 @@
-"""Evaluation of loop closing against ground truth. Conventions: `ldo_service.geometry`."""
+"""Evaluation of loop closing against ground truth.
+
+`ldo_service.geometry` describes the conventions of poses.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -31,7 +34,7 @@ candidates."""
 
 @dataclass(frozen=True, slots=True)
 class ComparedPair:
-    """Loop candidate: two subgraphs that were compared, by the ids of their keyframes."""
+    """Loop candidate: two compared subgraphs; each is a tuple of the ids of its keyframes."""
 
     newer: tuple[int, ...]
     older: tuple[int, ...]
@@ -46,7 +49,7 @@ class LoopClosed:
     Attributes:
         keyframe: Id of the new keyframe.
         reference: Id of the old keyframe.
-        T_reference_keyframe: Measured relative pose, [4, 4].
+        T_reference_keyframe: Measured transform from the new to the old camera, [4, 4].
     """
 
     keyframe: int
@@ -71,7 +74,7 @@ class SeenKeyframe:
         frame: Index of its frame in the sequence.
         T_world_camera: True pose, [4, 4].
         camera: Intrinsics of the subsampled depth.
-        depth_m: Subsampled depth, [H, W].
+        depth_m: Subsampled depth, [H, W], meters; 0 where unknown.
     """
 
     id: int
@@ -85,7 +88,8 @@ class SeenKeyframe:
 class LoopErrors:
     """Scores of loop closing; a ratio is None if its denominator is 0.
 
-    A pair of subgraphs is true if both show the same surfaces, see the constant `PROTOCOL`.
+    A subgraph is a group of keyframes. A pair of subgraphs is true if both show the same surfaces;
+    the constant `PROTOCOL` gives the criteria.
     """
 
     closures: int  # Number of loop closures of the run.
@@ -105,7 +109,7 @@ class LoopErrors:
 
     @property
     def recall(self) -> float | None:
-        """Fraction of the queries that have a loop closure of a true pair.
+        """Fraction of the queries that a loop closure connects to an older subgraph of a true pair.
 
         A query is a subgraph that forms a true pair with at least one older subgraph.
         """
@@ -115,11 +119,11 @@ class LoopErrors:
 def seen_keyframes(
     frames: Mapping[int, int], sequence: Frames, truth: Trajectory
 ) -> dict[int, SeenKeyframe]:
-    """Return the keyframes that have a true pose within 20 ms of their stamp, by id.
+    """Return the keyframes that have a true pose within 20 ms of their stamp, by keyframe id.
 
     Args:
         frames: Frame index of each keyframe, by keyframe id.
-        sequence: The sequence.
+        sequence: The sequence that the frame indices refer to.
         truth: True poses T_world_camera.
     """
     stamps_s = 1e-9 * sequence.stamps_ns[list(frames.values())]
@@ -180,9 +184,9 @@ def evaluate_loops(found: FoundLoops, keyframes: Mapping[int, SeenKeyframe]) -> 
 
 
 def overlap(new: SeenKeyframe, old: SeenKeyframe) -> float:
-    """Return the fraction of the measured pixels of `new` whose surface is also measured in `old`.
+    """Return the fraction of pixels with depth in `new` whose surface also has depth in `old`.
 
-    For speed, only about 40 pixels per row are compared.
+    For speed, only about 40 pixels per image row are compared.
     """
     step = max(1, new.camera.width // ASKED_ACROSS)
     sampled = np.zeros(new.depth_m.shape, bool)

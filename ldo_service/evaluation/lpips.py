@@ -1,4 +1,4 @@
-"""LPIPS, a perceptual image distance (Zhang et al., CVPR 2018), with a network from the user."""
+"""LPIPS image distance (Zhang et al., CVPR 2018), computed by a network file of the user."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ OF_EQUAL_IMAGES = 1e-4  # Maximum distance of an image to itself, by which the n
 class Lpips:
     """LPIPS of two images, computed by an ONNX network with the inputs and outputs of `LAYOUT`.
 
-    Height and width of the network may be dynamic.
+    The network may fix the height and width of the images, or leave them dynamic.
 
     Raises:
         ConfigError: If the file is not a network with these inputs and outputs. The constructor or
@@ -32,7 +32,7 @@ class Lpips:
         options.log_severity_level = 4  # Turns the log off: the exception has the message.
         try:
             if not path.is_file():
-                raise FileNotFoundError("there is no such file")
+                raise FileNotFoundError("the option --lpips must name an existing file")
             self._session = onnxruntime.InferenceSession(
                 str(path), options, providers=["CPUExecutionProvider"]
             )
@@ -59,10 +59,10 @@ class Lpips:
         except Exception as error:
             raise ConfigError(
                 f"--lpips {self.path} fails on images of {a.shape[1]}x{a.shape[0]} pixels: "
-                f"{_first_line(error)}. Export it with dynamic height and width."
+                f"{_first_line(error)}. Export the network with dynamic height and width."
             ) from error
         if out.size != 1:
-            raise self._misfit(f"the output has the shape {out.shape}, expected one number")
+            raise self._misfit(f"the output has the shape {out.shape}, but must be a single number")
         return float(out.item())
 
     def _require_layout(self) -> None:
@@ -74,15 +74,15 @@ class Lpips:
         )
         if len(inputs) != 2 or len(outputs) != 1 or not are_images:
             raise self._misfit(
-                f"the inputs have the shapes {shapes} and there are {len(outputs)} outputs, "
-                "expected two float32 images [1, 3, H, W] and one output"
+                f"the network has inputs of the shapes {shapes} and {len(outputs)} outputs, but "
+                "must have two float32 inputs [1, 3, H, W] and one output"
             )
 
     def _require_distance(self, image: np.ndarray) -> None:
         itself = self._distance(image, image)
         if not abs(itself) <= OF_EQUAL_IMAGES:
             raise self._misfit(
-                f"the distance of an image to itself is {itself:.3g}, expected almost 0"
+                f"the LPIPS distance of two equal images is {itself:.3g}, but must be almost 0"
             )
 
     def _misfit(self, finding: str) -> ConfigError:

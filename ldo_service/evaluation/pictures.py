@@ -21,11 +21,11 @@ NAMES = "xyz"
 
 
 def trajectory_picture(estimate: Trajectory, truth: Trajectory | None) -> np.ndarray:
-    """Draw the estimate (blue) and the truth (gray) from above and from the side.
+    """Draw the estimated (blue) and the true trajectory (gray) from above and from the side.
 
-    If at least three poses have a true pose within 20 ms, the estimate is aligned to the truth. The
-    truth before and after the estimate is then not drawn. The view from above shows the two world
-    axes with the largest extent of the camera motion.
+    If at least three estimated poses have a true pose within 20 ms, the estimate is aligned to the
+    truth. The truth is then drawn only from the first to the last of these true poses. The view
+    from above shows the two world axes with the largest extent of the camera motion.
 
     Returns:
         The picture, RGB [H, W, 3] uint8.
@@ -53,8 +53,9 @@ def depth_picture(depth_m: np.ndarray, range_m: tuple[float, float] | None = Non
     """Draw depth in Turbo colors: near is red, far is blue, unknown is black.
 
     Args:
-        depth_m: Depth [H, W]; 0 or not finite where unknown.
-        range_m: Nearest and farthest depth of the color scale; None for those of `depth_range`.
+        depth_m: Depth, [H, W], meters; 0 or not finite where unknown.
+        range_m: Nearest and farthest depth of the color scale, meters; None for the values of
+            `depth_range`.
 
     Returns:
         The picture, RGB [H, W, 3] uint8.
@@ -71,7 +72,7 @@ def depth_picture(depth_m: np.ndarray, range_m: tuple[float, float] | None = Non
 
 
 def depth_range(depth_m: np.ndarray) -> tuple[float, float]:
-    """Return the 2nd and 98th percentile of the known depth [H, W]; zeros if all is unknown."""
+    """Return the 2nd and 98th percentiles of the known depth, meters; zeros if none is known."""
     seen = depth_m[np.isfinite(depth_m) & (depth_m > 0)]
     if seen.size == 0:
         return 0.0, 0.0
@@ -80,7 +81,7 @@ def depth_range(depth_m: np.ndarray) -> tuple[float, float]:
 
 
 def error_picture(a: np.ndarray, b: np.ndarray, gain: float) -> np.ndarray:
-    """Return gain * |a - b| as uint8, for images [H, W, 3] in 0..1."""
+    """Return gain * |a - b| as a uint8 image, for two images a and b [H, W, 3] in 0..1."""
     return np.round(np.clip(gain * np.abs(a - b), 0, 1) * 255).astype(np.uint8)
 
 
@@ -100,7 +101,9 @@ def contact_sheet(
         ValueError: If there is no image, or the numbers of images, captions and labels differ.
     """
     if not rows or any(len(row) != len(captions) for row in rows) or not captions:
-        raise ValueError("a contact sheet must have at least one row, with one image per caption")
+        raise ValueError(
+            "a contact sheet must have at least one row, and one image per caption in each row"
+        )
     if labels is not None and len(labels) != len(rows):
         raise ValueError("a contact sheet must have a label for each row, or no labels at all")
     height, width = rows[0][0].shape[:2]

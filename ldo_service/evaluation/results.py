@@ -1,4 +1,4 @@
-"""Evaluation of a finished run: all scores, pictures and their JSON."""
+"""Evaluation of a finished run: scores, pictures, and the results as JSON."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -57,7 +57,7 @@ def evaluate_run(
         sequence: Source of the run, with ground truth and true labels if known.
         advance: Progress function, called with the number of frames done so far; the function
             `work` of this module returns the total.
-        distance: LPIPS, see `views.evaluate_rendering`; None to omit LPIPS.
+        distance: Function that returns the LPIPS distance of two images; None to omit LPIPS.
         threads: Threads of the renderer.
         evaluated: Frames whose renderings are evaluated; None for all held-out frames and every
             fifth training frame, see `views.PROTOCOL`.
@@ -105,7 +105,7 @@ def work(run: FinishedRun, sequence: Sequence) -> int:
 
 
 def has_labels(run: FinishedRun) -> bool:
-    """Return whether a map of the run has labels."""
+    """Return whether at least one map of the run has labels."""
     return any(posed.semantics is not None for posed in run.maps)
 
 
@@ -154,7 +154,7 @@ def compare(run: FinishedRun, truth: Trajectory) -> dict[str, TrajectoryErrors]:
 def sheet_of_newest(
     run: FinishedRun, sequence: Sequence, renderings: list[RenderingErrors], threads: int
 ) -> np.ndarray:
-    """Draw the contact sheet of the newest map, [H, W, 3] uint8.
+    """Draw the contact sheet of the last map of a run, [H, W, 3] uint8.
 
     The sheet shows held-out frames, or training frames if no frame was held out.
     """
@@ -167,7 +167,9 @@ def sheet_of_newest(
 
 
 def draw(folder: Path, pictures: dict[str, np.ndarray]) -> list[Path]:
-    """Save pictures to a folder, by file name, and return their paths.
+    """Save pictures to a folder, and return the paths of their files.
+
+    The keys of `pictures` are the file names.
 
     Raises:
         ConfigError: If a file cannot be written.

@@ -1,4 +1,4 @@
-"""Evaluation of a map's labels, which are rendered at the poses of frames, against true labels."""
+"""Comparison of true labels with the labels of a map, rendered at the poses of frames."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -54,11 +54,11 @@ instead of objects."""
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ListErrors:
-    """Errors of the labels, evaluated with one list of label names.
+    """Label errors of a map, evaluated with one list of label names.
 
     Attributes:
-        labels: The list of C names.
-        frames: Indices of the frames.
+        labels: The list of C label names.
+        frames: Indices of the evaluated frames in the sequence.
         confusions: Confusion matrix [C, C + 1] of each frame, see `label_measures.confusion`.
     """
 
@@ -68,15 +68,15 @@ class ListErrors:
 
     @property
     def pooled(self) -> np.ndarray:
-        """Sum of the confusions of all frames."""
+        """Sum of the confusion matrices of all frames, [C, C + 1]."""
         return np.sum(self.confusions, axis=0)
 
     def figures(self, gate: float) -> Segmentation:
         """Return the metrics of all pixels of all frames together.
 
         Args:
-            gate: Minimum fraction of the true pixels, 0..1, of a class in the means over classes;
-                see `label_measures.segmentation`.
+            gate: A class enters the means over classes if its fraction of all true pixels exceeds
+                this value, 0..1; see `label_measures.segmentation`.
         """
         return segmentation(self.pooled, gate)
 
@@ -148,7 +148,7 @@ class MapLabels:
 
 
 class LabelEvaluator:
-    """Accumulator of the label errors of one map, view by view."""
+    """Accumulator of the label errors of one map, to which views are added one by one."""
 
     def __init__(self, map_names: Sequence[str], class_names: Sequence[str]) -> None:
         self._lists = (coco_list(class_names), full_list(class_names))
@@ -160,7 +160,7 @@ class LabelEvaluator:
         self._agreement, self._pairs = Agreement(), 0
 
     def see(self, view: LabelView) -> None:
-        """Add a view."""
+        """Add the label errors of a view."""
         self._frames.append(view.frame.index)
         for labels, tables, seen in zip(self._lists, self._tables, self._confusions, strict=True):
             truth, shown = tables[0][view.truth.class_ids], tables[1][view.shown]
@@ -168,7 +168,7 @@ class LabelEvaluator:
         self._open.add(view.truth, self._tables[1][0][view.truth.class_ids], view.shown)
 
     def compare(self, first: np.ndarray, second: np.ndarray, pixels: Correspondences) -> None:
-        """Add a pair of views for consistency.
+        """Add the agreement of the map's labels between two views, for the consistency score.
 
         Args:
             first: Labels of the map in the first view, [H, W].
@@ -207,7 +207,8 @@ def evaluate_labels(
         threads: Threads of the renderer.
 
     Returns:
-        Errors of each map; empty if the run has no labels or the source has no true labels.
+        Errors of each labelled map; empty if the run has no labels, or the source has no true
+        labels.
 
     Raises:
         DataError: If a frame has no true labels or no pose.
@@ -232,7 +233,7 @@ def evaluate_labels(
 def labelled_maps(
     sequence: datasets.Sequence, run: FinishedRun, threads: int = 1
 ) -> list[MapLabels]:
-    """Return the maps of a run that have labels."""
+    """Return a label renderer for each labelled map of a run."""
     return [
         MapLabels(sequence, posed, posed.semantics, threads)
         for posed in run.maps
@@ -241,7 +242,7 @@ def labelled_maps(
 
 
 class Pairs:
-    """Frame pairs: two frames that have a pose and whose indices differ by three."""
+    """Frame pairs for label consistency: two frames with poses, three frame indices apart."""
 
     def __init__(self, sequence: datasets.Sequence, run: FinishedRun) -> None:
         self._sequence = sequence
@@ -258,8 +259,8 @@ class Pairs:
             image: Color and depth of the first frame.
 
         Returns:
-            The frame whose index is three higher, and the corresponding pixels of both frames. Both
-            are None if that frame does not exist or one of the two has no known pose.
+            The frame whose index is three higher, and the corresponding pixels of the two frames.
+            Both results are None if there is no such frame, or if a frame of the pair has no pose.
         """
         other = self._by_index.get(frame.index + APART)
         T_first = _at(self._known, frame.stamp_ns)

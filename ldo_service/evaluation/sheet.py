@@ -20,11 +20,11 @@ def rendering_sheet(
     """Draw rows [camera, map, error, camera depth, map depth] of some frames, as uint8 RGB.
 
     The text above a row gives the frame number, its PSNR and the common range of both depth images.
-    The frames are those with the best and the worst PSNR, and others evenly spread between them.
+    The frames are those with the best and the worst PSNR, and others evenly spread over the run.
 
     Args:
-        errors: Errors of the frames.
-        view_of_frame: Function that renders the view of a frame, given by its index.
+        errors: Rendering errors of the frames.
+        view_of_frame: Function that takes a frame index and returns the rendered view of the frame.
         count: Number of frames.
 
     Raises:
@@ -40,7 +40,7 @@ def rendering_sheet(
 def some_of(views: tuple[ViewErrors, ...], count: int = VIEWS) -> list[ViewErrors]:
     """Choose the views with the best and the worst PSNR, and others evenly spread over the frames.
 
-    The result is sorted by frame.
+    The result is sorted by frame index.
     """
     special = {_worst(views), _best(views)} if views else set()
     others = [view for view in views if view not in special]

@@ -34,7 +34,7 @@ class ErrorStatistics:
 
     @staticmethod
     def of(errors: np.ndarray) -> "ErrorStatistics":
-        """Return the statistics of errors [N]."""
+        """Return the statistics of N errors, [N]."""
         return ErrorStatistics(
             float(np.sqrt(np.mean(errors**2))),
             float(np.mean(errors)),
@@ -85,7 +85,7 @@ def associated(estimate: Trajectory, truth: Trajectory) -> np.ndarray:
     """Pair estimated and true poses by nearest stamp within 20 ms.
 
     Returns:
-        Index of the estimated pose and of the true pose of each pair, [M, 2].
+        Indices of the estimated pose and the true pose of each of the M pairs, [M, 2].
 
     Raises:
         DataError: If there are fewer than 3 pairs.

@@ -1,4 +1,4 @@
-"""Comparison of a run's frames with renderings of the run's map at the poses of the frames."""
+"""Comparison of the frames of a run with renderings of its map at the same poses."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
@@ -65,8 +65,8 @@ def psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
     """
     if a.shape != b.shape or (a.dtype == np.uint8) != (b.dtype == np.uint8):
         raise ValueError(
-            f"PSNR of images {a.dtype}{a.shape} and {b.dtype}{b.shape}: the shapes must be equal, "
-            "and both images must be uint8 or both floating."
+            f"PSNR cannot compare images {a.dtype}{a.shape} and {b.dtype}{b.shape}: the shapes "
+            "must be equal, and both images must be uint8 or both floating-point."
         )
     peak = 255.0 if a.dtype == np.uint8 else 1.0
     squares = (a.astype(np.float64) - b) ** 2
@@ -82,9 +82,10 @@ def ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
 
         (2 m_a m_b + c1) (2 s_ab + c2) / ((m_a^2 + m_b^2 + c1) (s_a^2 + s_b^2 + c2))
 
-    The similarity is computed per channel under an 11x11 Gaussian window of sigma 1.5 px. The mean
-    is over the pixels whose window lies in the image. Only one scale is used. Some papers call the
-    multi-scale MS-SSIM by the same name; its values are often higher. Wang et al., TIP 2004.
+    This formula of Wang et al., TIP 2004, uses the means m_a and m_b, the standard deviations s_a
+    and s_b, and the covariance s_ab of a channel in an 11x11 Gaussian window of sigma 1.5 px. The
+    constants are c1 = 0.01^2 and c2 = 0.03^2. The mean is over channels and over pixels whose
+    window lies in the image. Some papers print the often higher multi-scale MS-SSIM as SSIM.
 
     Args:
         a: Image [H, W, 3].
@@ -99,8 +100,8 @@ def ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
     """
     if a.shape != b.shape or a.ndim != 3 or min(a.shape[:2]) < WINDOW_PX:
         raise ValueError(
-            f"SSIM of images {a.shape} and {b.shape}: the shapes must be equal and [H, W, C], with "
-            "H and W at least 11."
+            f"SSIM cannot compare images {a.shape} and {b.shape}: the shapes must be equal, and "
+            "must be [H, W, C] with H and W at least 11."
         )
     a, b = a.astype(np.float64), b.astype(np.float64)
     mean_a, mean_b = _windowed(a), _windowed(b)
@@ -120,7 +121,7 @@ def depth_error(rendered_m: np.ndarray, opacity: np.ndarray, measured_m: np.ndar
 
     Args:
         rendered_m: Rendered depth, [H, W], meters.
-        opacity: Rendered opacity, [H, W], 0..1. Pixels above 0.5 have a rendered depth.
+        opacity: Rendered opacity, [H, W], 0..1. Pixels with more than 0.5 have a rendered depth.
         measured_m: Measured depth, [H, W], meters; 0 where not measured.
     """
     measured = measured_m > 0
@@ -164,11 +165,11 @@ class RenderedView:
 
     @property
     def shown(self) -> np.ndarray:
-        """Rendering at the exposure of the frame, [H, W, 3] float32, 0..1."""
+        """Rendering with the exposure of the frame, [H, W, 3] float32, 0..1."""
         return self.recorded(self.exposure.applied(self.rendering.color))
 
     def recorded(self, color: np.ndarray) -> np.ndarray:
-        """Return an image [H, W, 3] of the map as the camera would record it.
+        """Distort a rendered image [H, W, 3] as the camera would record it.
 
         The image gets the vignetting of the camera, and the distortion that its rolling shutter
         causes in motion.
@@ -182,12 +183,12 @@ class RenderedView:
 
     @property
     def picture(self) -> np.ndarray:
-        """Rendering at the exposure of the frame, [H, W, 3] uint8."""
+        """Rendering with the exposure of the frame, [H, W, 3] uint8."""
         return np.round(self.shown * 255).astype(np.uint8)
 
     @property
     def psnr_db(self) -> float:
-        """PSNR over every valid pixel."""
+        """PSNR of the rendering over all valid pixels, dB."""
         return psnr(*every_pixel(self), self.valid)
 
 
@@ -235,20 +236,20 @@ class RenderingErrors:
 def every_pixel(view: RenderedView) -> Images:
     """Return camera image and rendering without a mask.
 
-    The rendering has the exposure of the frame, which is interpolated between keyframes.
+    The rendering has the exposure of the frame, interpolated between the neighboring keyframes.
     """
     return view.seen, view.shown
 
 
 def exposure_fitted(view: RenderedView) -> Images:
-    """Return camera image and rendering, with the exposure fitted to the camera image."""
+    """Return camera image and rendering; the rendering's exposure is fitted to the camera image."""
     shown, seen = view.recorded(view.rendering.color), view.seen
     fitted = fit_exposure(shown, seen, view.valid)
     return seen, fitted.applied(shown)
 
 
 def map_as_it_is(view: RenderedView) -> Images:
-    """Return camera image and rendering; the rendering has the exposure of the map."""
+    """Return camera image and rendering; the rendering keeps the colors of the map."""
     return view.seen, view.recorded(view.rendering.color.clip(0, 1))
 
 
@@ -268,7 +269,7 @@ TRAINING = {"B training": measured_pixels}
 
 @dataclass(frozen=True, slots=True)
 class EvaluatedFrames:
-    """Held-out frames (protocol A) and some training frames (protocol B), LOST ones included."""
+    """Held-out frames for protocol A, training frames for protocol B; both include LOST frames."""
 
     held_out: tuple[RunFrame, ...]
     training: tuple[RunFrame, ...]
@@ -288,7 +289,7 @@ class EvaluatedFrames:
         return [frame for frame in (*self.held_out, *self.training) if not frame.is_lost]
 
     def counts(self) -> str:
-        """Return a text with the numbers of frames for the protocols A and B of `PROTOCOL`."""
+        """Return a text that gives the numbers of frames for protocol A and for protocol B."""
         if not self.held_out:
             a = "A: none, because all frames were mapped; use `ldo run --hold-out-every 5`."
         else:
@@ -307,7 +308,7 @@ def view_of(
     """Render the map at the pose of a frame.
 
     Args:
-        image: Color and depth of the frame, before the correction of the camera.
+        image: Color and depth of the frame, without correction of vignetting and depth bias.
         posed: The map.
         frame: The frame of the run.
         threads: Threads of the renderer.
@@ -337,7 +338,7 @@ def evaluate_rendering(
     distance: Distance | None = None,
     threads: int = 1,
 ) -> list[RenderingErrors]:
-    """Compute the errors of each map under each protocol of HELD_OUT and TRAINING with frames.
+    """Compute the rendering errors of each map for each protocol in HELD_OUT and TRAINING.
 
     Args:
         sequence: Source of the frames.
@@ -367,7 +368,7 @@ def evaluate_rendering(
 def evaluate_view(
     view: RenderedView, is_held_out: bool, distance: Distance | None = None
 ) -> Iterator[tuple[str, ViewErrors]]:
-    """Yield the name of each protocol (see `PROTOCOL`) and the errors of a frame under it.
+    """Yield a pair for each protocol of `PROTOCOL`: its name, and the errors of the frame.
 
     Args:
         view: The frame with its rendering.

@@ -21,7 +21,7 @@ class AdamConfig:
 
     A rate approximates the change of its parameter in one step. The rates are 5 to 10 times as high
     as in 3DGS, because a keyframe gets tens of iterations instead of thousands. On a CPU, 0.35 s of
-    optimization give the quality that takes 4.5 s with the rates of 3DGS.
+    optimization reach the quality that takes 4.5 s with the rates of 3DGS.
     """
 
     mean_m: float = 5e-4
@@ -39,27 +39,33 @@ class AdamConfig:
         if not min(rates) >= 0:
             raise ConfigError(
                 named(self, "mean_m", "log_scale", "quat", "opacity_logit", "color")
-                + ": learning rates must be at least 0."
+                + ": all learning rates must be at least 0."
             )
         if not (0 <= self.beta1 < 1 and 0 <= self.beta2 < 1 and self.epsilon > 0):
             raise ConfigError(
                 named(self, "beta1", "beta2", "epsilon")
-                + ": beta1 and beta2 must lie in [0, 1), epsilon must be positive."
+                + ": beta1 and beta2 must lie in [0, 1), and epsilon must be positive."
             )
 
     def rates(self) -> np.ndarray:
-        """Return the learning rate of each column of a row (`gaussians.rows`), [16] float32."""
+        """Return the learning rates of the 16 columns of a Gaussian's row, [16] float32.
+
+        `gaussians.rows` lists the columns.
+        """
         groups = ((self.mean_m, 3), (self.log_scale, 3), (self.quat, 4), (self.opacity_logit, 1))
         out = [rate for rate, n in (*groups, (self.color, 3), (0.0, 2)) for _ in range(n)]
         return np.array(out, np.float32)
 
 
 def places_of_remaining(old_ids: np.ndarray, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the old indices [M] and the new indices [M] of the Gaussians that are in both maps.
+    """Return the indices of the M Gaussians that remain after a change of the map.
 
     Args:
-        old_ids: Identifiers before a change of the map, [K], ascending.
-        ids: Identifiers after it, [N].
+        old_ids: Ids of the Gaussians before the change, [K], ascending.
+        ids: Ids of the Gaussians after the change, [N].
+
+    Returns:
+        Indices into `old_ids`, [M], and indices into `ids`, [M], of the same Gaussians.
     """
     old_places = np.searchsorted(old_ids, ids)
     stays = np.append(old_ids, -1)[old_places] == ids
@@ -72,7 +78,8 @@ class Adam:
     A Gaussian that is invisible in an iteration does not change, and its moments do not decay.
 
     Attributes:
-        matches: Counter that increases when the moments follow added or removed rows of the map.
+        matches: Counter that increases when the moments are matched to a map whose rows were added
+            or removed.
         restores: Counter that increases when `restore` replaces the moments.
     """
 
@@ -99,14 +106,16 @@ class Adam:
             m <- b1 m + (1 - b1) g,  v <- b2 v + (1 - b2) g^2
             row <- row - rate (m / (1 - b1^t)) / (sqrt(v / (1 - b2^t)) + epsilon)
 
+        This is algorithm 1 of Kingma and Ba, 2015: g is the gradient, m and v are the moments of g,
+        t is the step count of the Gaussian, and b1 and b2 are `beta1` and `beta2` of `AdamConfig`.
         Gaussians that are hidden, or that are not in `gradients.indices`, stay as they are. The
-        result is bitwise equal for any number of threads. Source: Kingma and Ba, 2015, algorithm 1.
+        result is bitwise equal for any number of threads.
 
         Args:
             gaussians: The map; its rows change.
             gradients: Gradients of its visible rows.
             rate: Factor on the configured learning rates.
-            threads: Threads of the kernel.
+            threads: Number of threads of the kernel.
         """
         step = self.arguments(gaussians, rate)
         _adam.adam_step(
@@ -165,7 +174,7 @@ class Adam:
         return reached
 
     def arguments(self, gaussians: GaussianMap, rate: float = 1.0) -> AdamStep:
-        """Return the arguments of one Adam step on all rows of a map; no array is copied.
+        """Return the kernel arguments of an Adam step on all rows of a map, without copying arrays.
 
         Args:
             gaussians: The map.
@@ -194,7 +203,7 @@ class Adam:
         }
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Restore the exact state of a `snapshot`."""
+        """Restore the exact state that `snapshot` returned."""
         self._followed = None
         self.restores += 1
         self._ids, self._steps = state["ids"].copy(), state["steps"].copy()

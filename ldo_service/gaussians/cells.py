@@ -1,4 +1,4 @@
-"""Quadtree over an image: small cells at edges, large ones on uniform areas.
+"""Quadtree over an image: small cells at edges, large cells on uniform areas.
 
 Densification makes one Gaussian from each cell.
 """
@@ -42,10 +42,10 @@ class QuadtreeCells:
         """Return the mean of an image over each cell.
 
         Args:
-            image: [H, W] or [H, W, C].
+            image: Image with one channel [H, W] or C channels [H, W, C].
 
         Returns:
-            [M] or [M, C] float32.
+            Means of the M cells, [M] or [M, C] float32.
         """
         out = np.empty((len(self), *image.shape[2:]), np.float32)
         for size in np.unique(self.size).tolist():
@@ -64,22 +64,22 @@ def quadtree(
     max_contrast: float,
     max_depth_step: float,
 ) -> QuadtreeCells:
-    """Divide an image into square cells: cells that are not uniform are split into four.
+    """Divide an image into square cells; cells that are not uniform are split into four.
 
-    A cell is uniform if three conditions hold; a cell of one pixel needs only the last one:
+    A cell is uniform if three conditions hold. For a cell of one pixel, only the third one counts.
 
-    - Within the cell and a rim of one pixel, the values of each channel differ by at most
-      `max_contrast`.
+    - In the cell and a rim of one pixel, the values of each color channel differ by at most
+      `max_contrast` times 255.
     - The depths in the cell differ by at most `max_depth_step` times the largest depth in it.
     - All pixels of the cell are in `wanted`.
 
     Args:
-        color: [H, W, 3] uint8.
-        depth_m: [H, W] float32, meters.
+        color: Image, [H, W, 3] uint8.
+        depth_m: Depth of the image, [H, W] float32, meters.
         wanted: Pixels to cover, [H, W] bool. Each of these pixels is in exactly one cell; all other
             pixels are in no cell.
         coarsest_px: Edge of the largest cells, a power of 2.
-        max_contrast: Largest contrast of a uniform cell, 0..1.
+        max_contrast: Largest color difference in a uniform cell, as a fraction of 255.
         max_depth_step: Largest depth difference in a uniform cell, as a fraction of the largest
             depth in it.
 

@@ -1,4 +1,4 @@
-"""Records of what map replicas have not received yet: changed Gaussians and keyframe poses."""
+"""Records of changed Gaussians and keyframe poses that were not sent to map replicas yet."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -17,9 +17,9 @@ class Changes:
 
     Attributes:
         removed: Ids of removed Gaussians, [R] int64, ascending.
-        changed: Rows of published Gaussians whose parameters or labels have changed, [C] int64.
-            Empty if `drain` was called with `with_changed=False`.
-        added: Rows of Gaussians that were never published, [A] int64.
+        changed: Row indices of published Gaussians whose parameters or labels have changed, [C]
+            int64. Empty if `drain` was called with `with_changed=False`.
+        added: Row indices of Gaussians that were never published, [A] int64.
     """
 
     removed: np.ndarray
@@ -32,8 +32,8 @@ class ChangeLog:
 
     New Gaussians are published with the next update. Changed parameters of published Gaussians are
     published less often, because the Gaussian optimizer changes most visible Gaussians at every
-    keyframe. Motions of anchor keyframes are not recorded: each map replica applies them to its own
-    copy.
+    keyframe. Motions of anchor keyframes are not recorded, because each map replica applies them to
+    its own Gaussians.
     """
 
     def __init__(self) -> None:
@@ -47,11 +47,11 @@ class ChangeLog:
         self._is_changed = np.concatenate([self._is_changed, np.zeros(new, bool)])
 
     def changed(self, mask: np.ndarray) -> None:
-        """Record that the rows where `mask` [N] is true have changed."""
+        """Record that Gaussians have changed: those at the rows where `mask` [N] is true."""
         self._is_changed |= mask
 
     def mark_removed(self, gaussians: GaussianMap, mask: np.ndarray) -> None:
-        """Record that the rows where `mask` [N] is true are about to be removed."""
+        """Record that Gaussians are about to be removed: the rows where `mask` [N] is true."""
         ids = gaussians.ids[mask]
         self._removed.append(ids[ids < self._next_untold])
         self._is_changed = self._is_changed[~mask]
@@ -91,7 +91,10 @@ class ChangeLog:
         return Changes(removed, changed, np.arange(first_new, len(gaussians)))
 
     def mark_all_published(self, gaussians: GaussianMap) -> None:
-        """Drop all records, so that the whole map counts as published, as after a restore."""
+        """Drop all records, so that the whole map counts as published.
+
+        The caller does this after it restored the map.
+        """
         newest = int(gaussians.ids[-1]) if len(gaussians) else -1
         self._next_untold = max(self._next_untold, newest + 1)
         self._is_changed = np.zeros(len(gaussians), bool)
@@ -112,7 +115,7 @@ class PublishedPoses:
         self._min_m, self._min_rad = min_m, min_rad
 
     def add(self, keyframe: int, T_map_keyframe: np.ndarray) -> None:
-        """Record the pose [4, 4] of a new keyframe, which is published with the keyframe."""
+        """Record that the pose [4, 4] of a new keyframe is published together with the keyframe."""
         self._poses[keyframe] = T_map_keyframe
 
     def forget(self, keyframe: int) -> None:
@@ -120,7 +123,7 @@ class PublishedPoses:
         del self._poses[keyframe]
 
     def drain(self, poses: PoseTable) -> dict[int, np.ndarray]:
-        """Return the poses to publish now, by keyframe, and mark them as published.
+        """Return the poses to publish now, by keyframe id, and mark them as published.
 
         Args:
             poses: Current poses T_map_keyframe of all keyframes.
@@ -146,5 +149,5 @@ class PublishedPoses:
         return self._poses.of(self._poses)
 
     def restore(self, keyframes: Collection[int], T_map: np.ndarray) -> None:
-        """Replace all poses by the poses `T_map` [K, 4, 4] of `keyframes` from a snapshot."""
+        """Replace all poses by those of a snapshot: `T_map` [K, 4, 4] of the K `keyframes`."""
         self._poses.become(keyframes, T_map)

@@ -1,4 +1,4 @@
-"""Chunks: Gaussians of one anchor keyframe, as arrays and as bytes."""
+"""Chunk: the Gaussians of one anchor keyframe, as arrays and as bytes."""
 
 import struct
 from collections.abc import Iterable
@@ -22,9 +22,9 @@ class Chunk:
 
     Attributes:
         anchor: Id of the anchor keyframe.
-        ids: [M] int64, ascending.
-        rows: [M, 16] float32, in the map frame (see `gaussians.rows`).
-        labels: [M, 32] uint8.
+        ids: Ids of the M Gaussians, [M] int64, ascending.
+        rows: Parameters in the map frame (see `gaussians.rows`), [M, 16] float32.
+        labels: Labels as packed bytes (see `semantics.gaussian_labels`), [M, 32] uint8.
     """
 
     anchor: int
@@ -38,16 +38,16 @@ class Chunk:
         return np.full(len(self.ids), self.anchor, np.int32)
 
     def batch(self) -> GaussianBatch:
-        """Return the chunk as a batch."""
+        """Return the Gaussians of the chunk as a `GaussianBatch`."""
         return GaussianBatch(self.ids, self.rows, self.anchors, self.labels)
 
     def moved(self, motions: Iterable[np.ndarray]) -> "Chunk":
-        """Return the chunk after motions of its anchor keyframe.
+        """Return the chunk with its Gaussians moved along with their anchor keyframe.
 
         The result is bitwise equal to that of `GaussianMap.move_anchors`.
 
         Args:
-            motions: Transforms T_new_old [4, 4], in the order of the motions.
+            motions: Motions T_new_old [4, 4] of the anchor keyframe, the earliest first.
         """
         rows = self.rows
         for T_new_old in motions:
@@ -59,8 +59,8 @@ def pack(chunk: Chunk) -> bytes:
     """Compress a chunk to bytes.
 
     Ids are stored as differences of consecutive ids. Rows and labels are stored byte by byte: the
-    first byte of every Gaussian, then the second byte of every Gaussian, and so on. This compresses
-    better, because neighboring Gaussians often have equal bytes.
+    first byte of every Gaussian, then the second byte of every Gaussian, and so on. This order
+    compresses better, because neighboring Gaussians often have equal bytes.
     """
     steps = np.diff(chunk.ids, prepend=0).astype("<i8")
     planes = np.ascontiguousarray(chunk.rows, "<f4").view(np.uint8).T
@@ -73,7 +73,8 @@ def unpack(data: bytes | memoryview) -> Chunk:
     """Return the chunk from its packed form.
 
     Raises:
-        DataError: The bytes are not a packed chunk, or an earlier version wrote them.
+        DataError: The bytes are not a packed chunk, or an earlier version of the service wrote
+            them.
     """
     try:
         body = zstandard.ZstdDecompressor().decompress(data)
@@ -83,7 +84,7 @@ def unpack(data: bytes | memoryview) -> Chunk:
         if planes.size == 4 * ROW * count > 0:
             raise DataError(
                 f"the file contains {count} Gaussians without labels, because an earlier version "
-                "wrote it; start with another state folder"
+                "of the service wrote it; start with another state folder"
             )
         planes = planes.reshape(4 * ROW + LABEL_BYTES, count).T
         rows = np.ascontiguousarray(planes[:, : 4 * ROW]).view("<f4")

@@ -1,4 +1,4 @@
-"""Records in memory of the chunks whose Gaussians are on disk or lost."""
+"""Records of chunks whose Gaussians are on disk or lost; the records stay in memory."""
 
 from dataclasses import dataclass, replace
 
@@ -9,10 +9,10 @@ from ldo_service.geometry import se3
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ChunkEntry:
-    """Table entry of one offloaded chunk.
+    """Table entry of one offloaded chunk, which is the Gaussians of one anchor keyframe in a file.
 
-    The entry stays in memory while the Gaussians are in a file. The chunk has `count` Gaussians,
-    whose ids go from `first_id` to `last_id`, with gaps if `count` is smaller than this range.
+    The entry stays in memory while the Gaussians are in the file. The chunk has `count` Gaussians.
+    Their ids lie between `first_id` and `last_id`, both included; some ids between may be missing.
     """
 
     anchor: int  # Id of the anchor keyframe.
@@ -25,14 +25,14 @@ class ChunkEntry:
     motions: tuple[np.ndarray, ...] = ()
 
     def moved(self, T_new_old: np.ndarray) -> "ChunkEntry":
-        """Return the entry after a motion T_new_old [4, 4] of its anchor keyframe."""
+        """Return the entry with a further motion T_new_old [4, 4] of its anchor keyframe."""
         center = se3.transform(T_new_old, self.center_map)
         return replace(self, center_map=center, motions=(*self.motions, T_new_old))
 
 
 @dataclass(frozen=True, slots=True)
 class LostIdRange:
-    """Range of the ids of a damaged chunk, both ends included.
+    """Range of Gaussian ids in a damaged chunk; both ends are included.
 
     Ids in this range that are neither in memory nor in another chunk are lost.
     """

@@ -1,4 +1,4 @@
-"""Confirmation of Gaussians: each must be visible in the image of at least one keyframe."""
+"""Confirmation of Gaussians: each Gaussian must be visible in at least one keyframe image."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ from .renderer import VisibleGaussians
 
 
 class Confirmation:
-    """Choice of the keyframes whose Gaussians are checked with each new keyframe.
+    """Choice of keyframes: each new keyframe starts a visibility check of their Gaussians.
 
     Args:
         store: Store of the keyframe images.
@@ -25,10 +25,10 @@ class Confirmation:
     def start(self, newest: int, gaussians: int) -> "VisibilityCheck":
         """Start a check of the Gaussians of two keyframes.
 
-        The first keyframe is the newest one that has `confirm_keyframes` later keyframes. The
-        second one is drawn at random from the first one and all earlier keyframes, since the map
-        around old keyframes also changes. No keyframe is checked while there are too few of them,
-        or if `min_weight_px` is 0.
+        The first keyframe is the newest keyframe that has `confirm_keyframes` later keyframes. The
+        second keyframe is drawn at random from the first one and all earlier keyframes, because the
+        map around old keyframes also changes. The check is empty if there are too few keyframes, or
+        if `min_weight_px` is 0.
 
         Args:
             newest: Id of the newest keyframe.
@@ -46,17 +46,18 @@ class Confirmation:
 class VisibilityCheck:
     """Search for hidden Gaussians, by their blending weights in optimizer iterations.
 
-    The optimizer computes the weights anyway, so the check needs no renderings of its own. Such
-    renderings took 6 % of the mapper's CPU time on the sequence kitchen.
+    The Gaussian optimizer computes the weights anyway, so the check needs no extra renderings.
+    Extra renderings took 6 % of the mapper's CPU time on the sequence kitchen.
 
     Args:
         newest: Id of the newest keyframe.
         keyframes: Older keyframes whose Gaussians are checked.
         gaussians: Number N of Gaussians, which must not change during the check.
-        min_weight_px: Least sum of a visible Gaussian's blending weights over an image.
+        min_weight_px: Threshold for the sum of a Gaussian's blending weights over the pixels of an
+            image. A Gaussian with a smaller sum is hidden in this image.
 
     Attributes:
-        keyframes: As above.
+        keyframes: Older keyframes whose Gaussians are checked.
     """
 
     def __init__(
@@ -85,8 +86,8 @@ class VisibilityCheck:
         """Return the mask of the hidden Gaussians that are anchored to the checked keyframes.
 
         A Gaussian is hidden if its blending weights sum to less than `min_weight_px` in each
-        iteration on the newest keyframe and on the checked keyframes. If no iteration ran on its
-        anchor keyframe or on the newest keyframe, it does not count as hidden.
+        iteration on the newest keyframe and on the checked keyframes. It does not count as hidden
+        if its anchor keyframe or the newest keyframe had no iteration.
 
         Args:
             anchors: Anchor keyframe of each Gaussian, [N].

@@ -40,18 +40,18 @@ def surfels(
 
     Seen from this camera, each Gaussian looks round. In the image, its standard deviation is
     `sigma_per_spacing` times the side of its cell. On a slanted surface, the standard deviation
-    down the slope is `1 / cos(angle)` times the standard deviation across the slope; `angle` is
-    between the normal and the viewing ray. The standard deviation along the normal is `thickness`
-    times the standard deviation across the slope.
+    down the slope is `1 / cos(angle)` times the standard deviation across the slope. Here `angle`
+    is the angle between the normal and the viewing ray. The standard deviation along the normal is
+    `thickness` times the standard deviation across the slope.
 
     Args:
         cells: The cells.
-        color: [H, W, 3] uint8.
-        depth_m: [H, W] float32, > 0 in every cell.
+        color: Image, [H, W, 3] uint8.
+        depth_m: Depth, [H, W] float32, meters, > 0 in every cell.
         camera: Intrinsics.
         T_map_camera: Camera pose, [4, 4].
-        sigma_per_spacing: Standard deviation as a fraction of the cell's side.
-        thickness: Standard deviation along the normal as a fraction of the one across the slope.
+        sigma_per_spacing: Standard deviation in the image as a fraction of the cell's side.
+        thickness: Standard deviation along the normal as a fraction of that across the slope.
         max_stretch: Upper bound of `1 / cos(angle)`.
         opacity: Opacity of each Gaussian, 0..1.
 
@@ -88,7 +88,7 @@ def normals_of(
         cells: The M cells.
         rays: Viewing rays with z = 1 through the cell centers, [M, 3].
         z: Depths of the cells, [M], meters.
-        depth_m: Depth image, [H, W]; 0 where not measured.
+        depth_m: Depth image, [H, W], meters; 0 where not measured.
         camera: Intrinsics.
     """
     inverse = np.where(depth_m > 0, 1 / np.maximum(depth_m, 1e-6), 0).astype(np.float32)
@@ -116,8 +116,9 @@ def slope_axes(normals: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.nd
         rays: Viewing rays, [M, 3], in the same frame.
 
     Returns:
-        Rotations [M, 3, 3]; their columns are the directions down the slope, across the slope and
-        along the normal. Then |cos| [M] of the angle between normal and ray.
+        Rotations [M, 3, 3] and absolute cosines [M] of the angles between normal and ray. The
+        columns of a rotation are the directions down the slope, across the slope and along the
+        normal.
     """
     unit_rays = _unit(rays)
     cosines = np.sum(normals * unit_rays, axis=1, keepdims=True)
@@ -146,11 +147,11 @@ def _unit(v: np.ndarray) -> np.ndarray:
 class DensificationConfig:
     """Settings of the densification.
 
-    The comments of the settings give changes of PSNR in dB relative to the defaults, which reach
-    28.2 dB. They were measured on 75 frames of a Replica apartment with ground-truth poses. Every
-    5th frame was densified, and PSNR was measured on the other frames. The Gaussians were not
-    optimized, and pixels without opacity were excluded. The defaults were chosen on the same
-    frames.
+    Comments of the settings give changes of the PSNR in dB if a setting differs from its default.
+    The defaults reach 28.2 dB. All values were measured on 75 frames of a Replica apartment with
+    ground-truth poses. Every 5th frame was densified, and PSNR was measured on the other frames.
+    The Gaussians were not optimized, and pixels without opacity were excluded. The defaults were
+    chosen on the same frames.
     """
 
     # Criteria by which the map explains a pixel (LDO-SLAM paper, III.A).
@@ -313,13 +314,13 @@ def densify(
 def densification_mask(
     frame: RgbdFrame, rendering: Rendering, config: DensificationConfig
 ) -> np.ndarray:
-    """Return the pixels where a keyframe shows surface that the map lacks, with a margin.
+    """Return the mask of pixels where a keyframe shows surface that the map lacks.
 
-    The margin around these pixels is `overlap_px` wide.
+    The mask includes a margin of `overlap_px` pixels around these pixels.
 
     Args:
         frame: The keyframe, with color corrected to the exposure of the map.
-        rendering: The map at the pose of the keyframe.
+        rendering: Rendering of the map at the pose of the keyframe.
         config: Settings.
 
     Returns:
@@ -345,17 +346,20 @@ def _without(frame: RgbdFrame, ignore_mask: np.ndarray, before: Rendering) -> Rg
 
 
 def nearest_around(depth_m: np.ndarray, radius_px: int) -> np.ndarray:
-    """Return the least depth [H, W] within `radius_px` of each pixel; inf if none is measured."""
+    """Return the least depth [H, W] around each pixel, meters; inf if no depth is measured there.
+
+    The window includes all pixels up to `radius_px` away in each direction.
+    """
     window = np.ones((2 * radius_px + 1,) * 2, np.uint8)
     return cv2.erode(np.where(depth_m > 0, depth_m, np.float32(inf)), window)
 
 
 def with_small_holes_filled(depth_m: np.ndarray, radius_px: int) -> np.ndarray:
-    """Return depth [H, W] with small holes filled by the farthest depth within `radius_px`.
+    """Return depth [H, W], meters, with small holes filled by the farthest depth around them.
 
-    A hole is filled only if at least 40 % of the pixels within `radius_px` were measured. A hole
-    next to an object is usually background that the sensor's projector cannot reach. The farthest
-    depth is used for this reason.
+    A pixel without depth is filled only if at least 40 % of the pixels within `radius_px` have
+    depth. The farthest of their depths is used, because a hole next to an object is usually
+    background that the sensor's projector cannot reach.
     """
     window = np.ones((2 * radius_px + 1,) * 2, np.uint8)
     measured = depth_m > 0
@@ -370,16 +374,17 @@ def correct_colors(
     rendering: Rendering,
     max_step: float,
 ) -> None:
-    """Correct the color of each new Gaussian by the mean color error of its cell.
+    """Add the mean color error of its cell to the color of each new Gaussian.
 
-    The color error is the frame minus the rendering. Each channel stays in 0..1.
+    The color error is the color of the frame minus that of the rendering. Each channel stays in
+    0..1.
 
     Args:
         colors: Colors of the new Gaussians, [M, 3], 0..1; changed in place.
         cells: The cell of each Gaussian.
         frame: The keyframe.
         rendering: Rendering of the map with the new Gaussians at the pose of the keyframe.
-        max_step: Largest change of a channel.
+        max_step: Largest change of a color channel, 0..1.
     """
     missing = cells.mean_of(_unit_range(frame.color) - rendering.color)
     colors += missing.clip(-max_step, max_step)

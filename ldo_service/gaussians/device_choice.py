@@ -11,7 +11,7 @@ from .optimizer_backend import CpuBackend, OptimizerBackend, ShapeLimits
 
 
 def given(backend: OptimizerBackend) -> DeviceChoice:
-    """Return the choice of a backend that the caller of the optimizer has chosen."""
+    """Return the device choice that describes a backend given by the caller of the optimizer."""
     choice = on_cpu("the program chose it.")
     return replace(choice, device="cuda", name="GPU") if backend.can_fail else choice
 
@@ -19,10 +19,10 @@ def given(backend: OptimizerBackend) -> DeviceChoice:
 def choose_backend(
     wanted: str, adam: AdamConfig, weights: LossWeights, limits: ShapeLimits
 ) -> tuple[OptimizerBackend, DeviceChoice]:
-    """Choose a device, and return its backend of the optimizer.
+    """Return the backend of the Gaussian optimizer for the chosen device, and the device choice.
 
-    A GPU is used if `wanted` is cuda or auto, and if the GPU passes the self-test. The CPU replaces
-    a GPU that is missing or fails.
+    A GPU is chosen if `wanted` is cuda or auto and the GPU passes the self-test. Otherwise, the CPU
+    is chosen.
 
     Args:
         wanted: Setting `service.device`.

@@ -47,20 +47,20 @@ class Exposure:
 
     @classmethod
     def of(cls, matrix: np.ndarray) -> "Exposure":
-        """Return the exposure from a matrix [2, 3], as `matrix` returns it."""
+        """Return the exposure of a matrix [2, 3]: row 0 holds the gains, row 1 the biases."""
         return cls(*np.array(matrix, np.float32))
 
     @property
     def matrix(self) -> np.ndarray:
-        """Matrix [2, 3] float32: gains, then biases."""
+        """Matrix [2, 3] float32: row 0 holds the gains, row 1 the biases."""
         return np.array([self.gain, self.bias])
 
     def applied(self, color: np.ndarray) -> np.ndarray:
-        """Convert colors [H, W, 3] in 0..1 from the exposure of the map to this one, and clip."""
+        """Convert map colors [H, W, 3] in 0..1 to seen colors, clipped to 0..1."""
         return (self.gain * color + self.bias).clip(0, 1)
 
     def removed(self, color: np.ndarray) -> np.ndarray:
-        """Convert colors [H, W, 3] in 0..1 from this exposure to that of the map, and clip."""
+        """Convert seen colors [H, W, 3] in 0..1 to map colors, clipped to 0..1."""
         return ((color - self.bias) / np.maximum(self.gain, MIN_GAIN)).clip(0, 1)
 
 
@@ -69,12 +69,12 @@ def fit_exposure(
 ) -> Exposure:
     """Fit gain and bias by least squares, such that `seen` = gain * `rendered` + bias.
 
-    Use this function for evaluation only, because it fits to the same image with which the
-    rendering is compared afterwards. A channel without contrast gets a gain of one.
+    Use this function for evaluation only: it uses the image that the rendering is compared with.
+    A channel without contrast gets a gain of one.
 
     Args:
-        rendered: [H, W, 3], 0..1.
-        seen: [H, W, 3], 0..1.
+        rendered: Rendered colors, [H, W, 3], 0..1.
+        seen: Colors of the camera image, [H, W, 3], 0..1.
         mask: Pixels to use, [H, W] bool; None for all.
     """
     used = np.ones(rendered.shape[:2], bool) if mask is None else mask
@@ -88,7 +88,7 @@ def fit_exposure(
 def estimate_exposure(
     rendered: np.ndarray, opacity: np.ndarray, seen: np.ndarray, mask: np.ndarray | None = None
 ) -> Exposure | None:
-    """Estimate gain and bias of an image relative to the rendering of the map at its pose.
+    """Estimate gain and bias of a camera image relative to a rendering at the same pose.
 
     The estimate is a least-squares fit over mean colors of pixel blocks. Only opaque, unsaturated
     pixels are used. Outliers, such as moved objects and new surface, are excluded. A prior pulls
@@ -96,9 +96,9 @@ def estimate_exposure(
 
     Args:
         rendered: Rendered color, [3, H, W], 0..1.
-        opacity: Rendered opacity, [H, W].
+        opacity: Rendered opacity, [H, W], 0..1.
         seen: Image of the camera, [3, H, W] uint8.
-        mask: Pixels to use, [H, W] uint8; 0 where a pixel is ignored. None to use all.
+        mask: [H, W] uint8; pixels with value 0 are ignored. None uses all pixels.
 
     Returns:
         The exposure. None if the two images probably show different surfaces: too few blocks are
@@ -122,7 +122,7 @@ class ImageBlocks:
 
     @classmethod
     def of(cls, seen: np.ndarray, mask: np.ndarray | None = None) -> "ImageBlocks":
-        """Average an image of the camera; `estimate_exposure` describes the arguments."""
+        """Average a camera image over blocks; `estimate_exposure` describes the arguments."""
         color = np.stack([_averaged(plane) for plane in seen]) * np.float32(1 / 255)
         usable = _averaged(seen.max(axis=0) >= 255 * SATURATED) == 0
         if mask is not None:
@@ -135,7 +135,7 @@ def fit_blocks(rendered: np.ndarray, opacity: np.ndarray, seen: ImageBlocks) -> 
 
     Args:
         rendered: Mean rendered colors of B rows of C blocks, [3, B, C], 0..1.
-        opacity: Mean rendered opacities, [B, C].
+        opacity: Mean rendered opacities, [B, C], 0..1.
         seen: The same blocks of the camera image.
 
     Returns:
@@ -153,7 +153,7 @@ def fit_blocks(rendered: np.ndarray, opacity: np.ndarray, seen: ImageBlocks) -> 
 
 
 def block_side(width: int) -> int:
-    """Return the side in pixels of the blocks that an image of this width is averaged over."""
+    """Return the side, in pixels, of the square blocks of an image that is `width` pixels wide."""
     return max(MIN_BLOCK_PX, width // BLOCKS_ACROSS)
 
 

@@ -1,9 +1,11 @@
 """Files of Gaussians that other programs read: PLY, .splat and .spz.
 
 .ply    The format of 3D Gaussian splatting and its viewers.
-.splat  32 bytes per Gaussian without a header, sorted by descending weight:
+.splat  32 bytes per Gaussian, and no header. Gaussians are sorted by opacity times volume,
+        largest first. The bytes of a Gaussian are:
             position 3 float32 | scale 3 float32, meters | RGBA 4 uint8 | quaternion wxyz 4 uint8
-        A byte of the quaternion is 128 (1 + q), so a rotation is accurate to about half a degree.
+        A quaternion component q is stored as the byte 128 (1 + q), so that a rotation is accurate
+        to about half a degree.
         Axes are those of the map. Format: https://github.com/antimatter15/splat
 .spz    Quantized and compressed to about a tenth of the size of a PLY.
         Means are fixed point with steps of 0.24 mm, up to 2 km. Log scales have steps of 1/16,
@@ -213,8 +215,8 @@ def _require_size(path: Path, header: _Header, found: int, each: int, unit: str)
         )
     if found > expected and header.is_last:
         raise DataError(
-            f"{path} has {found - expected} {unit} more than the {header.count} Gaussians in its "
-            "header need. Header and content do not match. Export the file again."
+            f"{path} has {found - expected} {unit} more than the {header.count} Gaussians that its "
+            "header announces. Header and content do not match. Export the file again."
         )
 
 

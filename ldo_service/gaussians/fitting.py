@@ -52,7 +52,7 @@ class ViewSamplingConfig:
         if min(self.recent, self.earlier) < 0 or not 0 <= self.min_shared <= 1:
             raise ConfigError(
                 named(self, "min_shared", "recent", "earlier")
-                + ": recent and earlier must be at least 0, min_shared must lie in 0..1."
+                + ": recent and earlier must be at least 0, and min_shared must lie in 0..1."
             )
 
 
@@ -61,11 +61,11 @@ class Fitting:
 
     Args:
         config: Settings of the Gaussian optimizer.
-        sampling: Settings of the choice of keyframes after a new keyframe.
+        sampling: Settings that determine which keyframes are used after a new keyframe.
         views: Keyframes to fit the map to.
         is_resident: Function that returns whether all Gaussians that may be visible in a keyframe
-            are in memory. Keyframes with the result False are skipped: the Gaussians in memory
-            would move to where offloaded Gaussians are missing.
+            are in memory. Other keyframes are skipped, because fitting to them would move the
+            Gaussians in memory into the gaps that offloaded Gaussians leave.
         seed: Seed of the random choice of keyframes.
         threads: Threads of the renderer.
     """
@@ -92,7 +92,7 @@ class Fitting:
         return self._optimizer.device
 
     def forget_view(self, keyframe: int) -> None:
-        """Drop the moments that the Gaussian optimizer keeps for the pose of a keyframe."""
+        """Drop the Adam moments that the Gaussian optimizer stores for the pose of a keyframe."""
         self._optimizer.forget_view(keyframe)
 
     def plan(self, newest: TrainingView, iterations: int, checked: Sequence[int] = ()) -> list[int]:
@@ -141,7 +141,7 @@ class Fitting:
         return covisibility_ratio(p_map, self._views.cameras[keyframe], self._views.poses[keyframe])
 
     def plan_refinement(self, iterations: int, first: Sequence[int]) -> Iterable[int]:
-        """Return keyframes of `first` and random keyframes alternately, `iterations` in total.
+        """Return `iterations` keyframes, alternately from `first` and at random.
 
         The result is shorter if offloaded Gaussians may be visible in most keyframes.
         """

@@ -29,15 +29,15 @@ MAX_FRAMES = 64
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ResidentFrame:
-    """Images of a view on the device.
+    """Copy of the images of a training view in GPU memory.
 
     Attributes:
-        color: Color image of the view on the host, while it exists.
-        mask: Mask of the view on the host, while it exists; None if the view has no mask.
-        image: Images on the device.
-        size: Width and height.
-        intrinsics: fx, fy, cx, cy.
-        blocks: Mean colors of blocks, for the estimate of the exposure.
+        color: Weak reference to the color image of the view in host memory.
+        mask: Weak reference to the mask of the view in host memory; None if it has no mask.
+        image: Color, depth and mask in GPU memory.
+        size: Width and height of the copy, pixels.
+        intrinsics: fx, fy, cx, cy of the copy, pixels.
+        blocks: Mean colors of pixel blocks, for the estimate of the exposure.
     """
 
     color: ref[np.ndarray]
@@ -48,7 +48,7 @@ class ResidentFrame:
     blocks: ImageBlocks
 
     def shows(self, view: TrainingView) -> bool:
-        """Return whether the images are those of a view."""
+        """Return whether these are the images of `view`."""
         mask = self.mask and self.mask()
         return self.color() is view.color and (
             view.mask is None if self.mask is None else mask is view.mask
@@ -56,17 +56,17 @@ class ResidentFrame:
 
 
 class GpuBackend:
-    """Iterations of the Gaussian optimizer by the kernels of `kernels.gpu`.
+    """Backend that runs iterations of the Gaussian optimizer with the kernels of `kernels.gpu`.
 
-    The device works on a copy of the map and of the moments of Adam. `begin` uploads changed rows,
-    and `end` downloads the rows that the iterations changed. An iteration downloads the weights of
-    the visible Gaussians, the terms of the loss, and mean colors for the exposure.
+    The GPU works on a copy of the map and of the Adam moments. `begin` uploads changed rows, and
+    `end` downloads the rows that the iterations changed. Each iteration downloads the blending
+    weights of the visible Gaussians, the terms of the loss, and mean colors for the exposure.
 
     The results are bitwise equal on one GPU model and one version of Triton. They differ from those
     of the CPU in the last bits of each iteration.
 
     Args:
-        arrays: Arrays of the device.
+        arrays: Array operations on the GPU.
         adam: Settings of Adam.
         weights: Weights of the image loss.
         limits: Limits on the shape of the Gaussians.

@@ -1,4 +1,4 @@
-"""Copy of a map on a GPU: rows, moments and step counts, in the order of the map."""
+"""Copy of a map in GPU memory: rows, Adam moments and step counts, in the order of the map."""
 
 from typing import Any
 from weakref import ref
@@ -14,20 +14,20 @@ from .rows import ROW
 
 
 class GaussianMirror:
-    """Rows, moments and step counts of a map on a device.
+    """Copy of the rows, Adam moments and step counts of a map in GPU memory.
 
-    A Gaussian takes 196 bytes. If the map grows, the capacity is at least doubled, so that the
-    mirror takes up to 392 bytes for each Gaussian. A change of the map may move Gaussians. The
-    mirror then moves one array after the other, which takes up to 192 bytes more per Gaussian.
+    A Gaussian takes 196 bytes. When the mirror must grow, its capacity at least doubles, so that a
+    Gaussian takes up to 392 bytes. The mirror copies its arrays one by one when it grows, and when
+    Gaussians get new indices. The copy takes up to 192 bytes more per Gaussian.
 
-    The mirror is a copy: the map and its `Adam` are on the CPU. `update` uploads what changed there
-    since the last call, and `write_back` downloads what the device changed. Between the two calls,
-    the map must not change.
+    The map and its `Adam` stay on the CPU. `update` uploads what changed on the CPU since the last
+    call, and `write_back` downloads what changed on the GPU. Between the two calls, the map must
+    not change.
 
     Attributes:
-        rows: Gaussians, [capacity, 16].
-        moments: First moments, [capacity, 16].
-        squares: Second moments, [capacity, 16].
+        rows: Gaussians, [capacity, 16] float32.
+        moments: First moments, [capacity, 16] float32.
+        squares: Second moments, [capacity, 16] float32.
         steps: Number of steps of each row, [capacity] int32.
         uploaded: Number of rows that the last `update` uploaded.
         downloaded: Number of rows that the last `write_back` downloaded.
@@ -44,10 +44,10 @@ class GaussianMirror:
         self.uploaded = self.downloaded = 0
 
     def update(self, gaussians: GaussianMap, adam: Adam) -> None:
-        """Upload all rows that the map has changed, and follow additions and removals.
+        """Upload all rows that changed in the map, and apply its additions and removals.
 
-        The moments are uploaded too if `adam` was restored since the last call, or if it adapted
-        its moments to a changed map more than once. The mirror cannot follow their rows then.
+        The moments are uploaded too if, since the last call, `adam` was restored or has adapted its
+        moments to additions or removals more than once. The mirror cannot follow such changes.
         """
         state = adam.arguments(gaussians)
         is_known = self._map is not None and self._map() is gaussians
@@ -66,7 +66,7 @@ class GaussianMirror:
             self._put(self.rows, changed, gaussians.rows[changed])
 
     def write_back(self, gaussians: GaussianMap, adam: Adam) -> None:
-        """Download the rows, moments and step counts that steps on the device changed."""
+        """Download the rows, Adam moments and step counts that changed on the GPU."""
         state = adam.arguments(gaussians)
         n = len(gaussians)
         steps = self._arrays.download(self.steps)[:n]

@@ -55,15 +55,15 @@ class Outcome:
 
 
 def run_self_test(arrays: Arrays, repeats: int = REPEATS) -> None:
-    """Compare iterations of the GPU backend with those of the CPU, and repeat them.
+    """Run iterations on the CPU once and on the GPU several times, and compare the results.
 
     Args:
-        arrays: Arrays of the GPU.
-        repeats: Number of repetitions, at least 1.
+        arrays: Array operations on the GPU.
+        repeats: Number of runs on the GPU, at least 1.
 
     Raises:
-        DeviceError: The device fails, its results differ from those of the CPU, or they differ
-            between repetitions.
+        DeviceError: The GPU fails, its results differ from those of the CPU, or its results differ
+            between two runs.
     """
     scene = _scene()
     for is_half in (False, True):
@@ -74,7 +74,9 @@ def run_self_test(arrays: Arrays, repeats: int = REPEATS) -> None:
             if first is None:
                 require_equal(got, wanted)
             elif not got.same_bits(first):
-                raise DeviceError("the results of the self-test differ between two repetitions.")
+                raise DeviceError(
+                    "the results of the self-test differ between two repetitions. Use the CPU."
+                )
             first = first or got
 
 
@@ -129,27 +131,28 @@ def iterate(
 
 
 def require_equal(got: Outcome, wanted: Outcome) -> None:
-    """Check the results of a GPU.
+    """Check that the results of a GPU equal those of the CPU, apart from rounding.
 
     Raises:
-        DeviceError: They differ from those of the CPU.
+        DeviceError: The results differ by more than rounding explains.
     """
     changed = np.mean(got.values["steps"] != wanted.values["steps"])
     if changed > MAX_BORDERLINE:
         raise DeviceError(
-            f"{changed:.1%} of the Gaussians are visible on only one of GPU and CPU, expected at "
-            f"most {MAX_BORDERLINE:.1%}."
+            f"{changed:.1%} of the Gaussians are visible on the GPU but not on the CPU, or the "
+            f"reverse. At most {MAX_BORDERLINE:.1%} is allowed. Use the CPU."
         )
     for name, difference in differences(got, wanted).items():
         limit = TOLERANCE[name.partition(" ")[0]]
         if not difference <= limit:  # NaN is above every limit.
             raise DeviceError(
-                f"{name} differs by {difference:.1e} from the CPU, at most {limit:.0e} is allowed."
+                f"{name} differs by a relative {difference:.1e} from the CPU; at most {limit:.0e} "
+                "is allowed. Use the CPU."
             )
 
 
 def differences(got: Outcome, wanted: Outcome) -> dict[str, float]:
-    """Return the differences of two results by name, relative to the norms of `wanted`."""
+    """Return the relative difference of each result: norm(got - wanted) / norm(wanted)."""
     pairs = {k: (got.values[k], wanted.values[k]) for k in ("loss", "weights", "pose", "exposure")}
     of_moments, of_steps = ([o.values[k] for o in (got, wanted)] for k in ("moments", "step"))
     for name, (first, last) in COLUMNS.items():

@@ -1,4 +1,4 @@
-"""Store of keyframe images on disk with a cache in memory, and training views from them."""
+"""Store of keyframe images on disk with a cache in memory, and the views of all keyframes."""
 
 import logging
 from collections import OrderedDict
@@ -45,7 +45,7 @@ class KeyframeStoreConfig:
         ):
             raise ConfigError(
                 named(self, "cache_mb", "quota_mb", "max_keyframes", "newest_kept")
-                + ": cache_mb must be at least 0, quota_mb must be positive, max_keyframes and "
+                + ": cache_mb must be at least 0, quota_mb must be positive, and max_keyframes and "
                 "newest_kept must be at least 1."
             )
 
@@ -53,8 +53,8 @@ class KeyframeStoreConfig:
 class KeyframeStore:
     """Store of keyframe images in `folder`, including images that the folder contains already.
 
-    If `folder` is None, the store uses a temporary folder, which it removes when it is closed. When
-    the store exceeds its quota, it drops the keyframe between the two stored keyframes with the
+    If `folder` is None, the store uses a temporary folder, which it removes when it is closed.
+    Above its quota, the store drops the keyframe whose previous and next stored keyframes have the
     closest ids, because these two probably show the same surface. If the disk is full, a new
     keyframe is available only while it is in the cache. The content depends only on the calls, not
     on time. Not thread-safe.
@@ -137,7 +137,7 @@ class KeyframeStore:
             images = unpack(self.files.read(keyframe))
             if images.keyframe != keyframe:
                 raise DataError(
-                    f"the file contains keyframe {images.keyframe}, expected keyframe {keyframe}"
+                    f"the file contains keyframe {images.keyframe} instead of keyframe {keyframe}"
                 )
         except DataError as error:
             log.warning(
@@ -194,8 +194,9 @@ class KeyframeViews:
         poses: T_map_camera [4, 4] of every keyframe of the run. A pose remains when the images are
             dropped, since Gaussians are anchored to the keyframe. A pose takes 136 bytes.
         exposures: Exposure of each keyframe with images.
-        horizons: Grid of the farthest depths of each keyframe with images. `cameras`, `exposures`
-            and `horizons` have the same order; together they take 1.5 kB per keyframe.
+        horizons: Largest depths in the blocks of the image, for each keyframe with images.
+            `cameras`, `exposures` and `horizons` list the keyframes in the same order. Together
+            they take 1.5 kB per keyframe.
     """
 
     def __init__(self, store: KeyframeStore) -> None:
@@ -240,7 +241,7 @@ class KeyframeViews:
         self.store.put(replace(images, mask=counts.astype(np.uint8)))
 
     def placed(self, keyframe: int) -> PlacedCamera:
-        """Return the camera of a keyframe, with its pose and the farthest depths in its image.
+        """Return the camera and pose of a keyframe, with the largest depth in each image block.
 
         Raises:
             KeyError: The keyframe is unknown or its images are dropped.

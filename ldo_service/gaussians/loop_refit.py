@@ -58,8 +58,8 @@ class LoopRefitConfig:
 def displaced_mask(T_now: np.ndarray, T_before: np.ndarray, config: LoopRefitConfig) -> np.ndarray:
     """Return which keyframes moved far relative to the oldest keyframe in the same cube of space.
 
-    Two grids of cubes are used, shifted by half an edge along each axis, since a boundary of one
-    grid may lie between the keyframes of two passes through the same place.
+    A boundary between two cubes may separate keyframes of the same place. Two grids of cubes are
+    therefore used, and the second grid is shifted by half an edge along each axis.
 
     Args:
         T_now: Poses T_map_keyframe after the correction, [K, 4, 4], oldest first.
@@ -94,7 +94,7 @@ class LoopRefit:
 
     Refit. A displaced keyframe gets pending refit iterations. Half of them optimize against this
     keyframe, the other half against random keyframes. Optimizing against displaced keyframes alone
-    would make the map worse in keyframes that did not move and show the same surface.
+    would make the map worse at other keyframes that show the same surface and did not move.
 
     This work is done in small amounts with each following keyframe, so that new keyframes are
     mapped without long delays.
@@ -129,7 +129,7 @@ class LoopRefit:
 
     @property
     def pending_iterations(self) -> int:
-        """Number of pending refit iterations, at most `iterations` per keyframe with images."""
+        """Number of pending refit iterations, at most `config.iterations` per keyframe."""
         return sum(self._pending.values())
 
     @property
@@ -141,7 +141,7 @@ class LoopRefit:
         )
 
     def with_keyframe(self, *, is_behind: bool) -> None:
-        """Do the deduplication and refit iterations that are due with one new keyframe.
+        """Run the deduplication and the refit iterations that are due after a new keyframe.
 
         Args:
             is_behind: True if more new keyframes wait to be mapped. Refit iterations are then

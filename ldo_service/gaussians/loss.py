@@ -55,13 +55,13 @@ def image_loss(
     tiles: np.ndarray | None = None,
     threads: int = 1,
 ) -> ImageLoss:
-    """Compare a rendering with a frame and compute dL/dplanes.
+    """Compute the loss L between a rendering and a frame, and its derivative dL/dplanes.
 
         L = l1 mean|x - y| + d_ssim (1 - mean SSIM(x, y)) + depth mean|D - d|,  x = gain C + bias
 
-    SSIM has an 11x11 Gaussian window of sigma 1.5 px, and pixels beyond the image count as 0, as in
-    3DGS (Wang et al., 2004; Kerbl et al., 2023). The result is bitwise equal for any number of
-    threads.
+    The factors l1, d_ssim and depth are the weights. SSIM has an 11x11 Gaussian window of sigma
+    1.5 px, and pixels beyond the image count as 0, as in 3DGS (Wang et al., 2004; Kerbl et al.,
+    2023). The result is bitwise equal for any number of threads.
 
     Args:
         planes: Rendering [5, H, W] float32: colors C, weighted depth D in meters, opacity (unused).
@@ -111,7 +111,7 @@ def image_loss(
 
 
 def tile_mask(tiles: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Return the mask [H, W] uint8 of the pixels in tiles that are not 0.
+    """Return the mask [H, W] uint8 that is 1 at the pixels of tiles with a value other than 0.
 
     Args:
         tiles: [ceil(H / 16), ceil(W / 16)].
@@ -123,6 +123,8 @@ def tile_mask(tiles: np.ndarray, height: int, width: int) -> np.ndarray:
     """
     shape = -(-height // TILE), -(-width // TILE)
     if tiles.shape != shape or not tiles.any():
-        raise ValueError(f"tiles {tiles.shape}: they must have shape {shape} and not all be 0.")
+        raise ValueError(
+            f"tiles of shape {tiles.shape} must have shape {shape} and must not all be 0."
+        )
     pixels = (tiles != 0).repeat(TILE, axis=0).repeat(TILE, axis=1)[:height, :width]
     return np.ascontiguousarray(pixels, np.uint8)

@@ -92,8 +92,8 @@ class MapBuilder:
             frame: Color and depth of the keyframe.
             T_map_camera: Pose of the keyframe, [4, 4].
             keyframe: Id of the keyframe, larger than all earlier ids.
-            iterations: Effort of the iterations; see `GaussianOptimizer.optimize`. Most of them
-                run at half resolution.
+            iterations: Limit of the computing time; see `effort` in `GaussianOptimizer.optimize`.
+                Most iterations run at half resolution.
             dynamic_mask: Pixels of moving objects, which are not mapped, [H, W] bool; None if none.
         """
         self._load_visible(PlacedCamera(frame.camera, T_map_camera, MaxDepthGrid.of(frame.depth_m)))
@@ -210,7 +210,7 @@ class MapBuilder:
 
         Args:
             iterations: Number of iterations.
-            rates: Factor on the learning rates at the first and at the last iteration.
+            rates: Factors on the learning rates at the first and at the last iteration.
             first: Keyframes that must be used.
             effort: Limit of the computation; see `GaussianOptimizer.optimize`.
 
@@ -238,8 +238,8 @@ class MapBuilder:
     def is_resident(self, keyframe: int) -> bool:
         """Return whether all Gaussians that may be visible in a keyframe are in memory.
 
-        If some are offloaded, do not fit the map to this keyframe: the Gaussians in memory would
-        move to where the offloaded Gaussians are missing.
+        If some are offloaded, do not fit the map to this keyframe. Otherwise the Gaussians in
+        memory would move into the gaps that the offloaded Gaussians leave.
         """
         return not self.offloaded.visible_chunks(self.views.placed(keyframe), self._reach_m)
 
@@ -331,7 +331,7 @@ class MapBuilder:
         return len(self.gaussians) + len(self.offloaded)
 
     def batches(self) -> Iterator[GaussianBatch]:
-        """Yield the whole map in batches; ids ascend throughout."""
+        """Yield the whole map in batches; ids ascend within and across batches."""
         yield from iter_all_gaussians(self.gaussians, self.offloaded)
 
     # --- publication ------------------------------------------------------------------------------
@@ -341,9 +341,9 @@ class MapBuilder:
         return self._log.drain(self.gaussians, with_changed=with_changed)
 
     def refined(self) -> dict[int, np.ndarray]:
-        """Return T_map_keyframe [4, 4] of the keyframes that the optimizer has moved, by id.
+        """Return the poses T_map_keyframe [4, 4], by id, that the Gaussian optimizer has moved.
 
-        The caller must publish them: the next call returns only poses that have moved again.
+        The caller must publish these poses: the next call returns only poses that have moved again.
         """
         return self._published.drain(self.views.poses)
 

@@ -34,5 +34,5 @@ class MapBuilderConfig:
         if self.prune_keyframes < 1 or min(self.refined_m, self.refined_rad, self.seed) < 0:
             raise ConfigError(
                 named(self, "prune_keyframes", "refined_m", "refined_rad", "seed")
-                + ": prune_keyframes must be at least 1, the others at least 0."
+                + ": prune_keyframes must be at least 1, and the others at least 0."
             )

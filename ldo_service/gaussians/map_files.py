@@ -22,7 +22,7 @@ class MapFiles:
         self._offloaded.retired.saved()
 
     def kept(self, *, is_previous_complete: bool) -> None:
-        """Remove files that no kept generation of the state needs.
+        """Remove files that no kept generation (older version) of the saved state needs.
 
         Args:
             is_previous_complete: See `RetiredFiles.kept`.
@@ -30,7 +30,7 @@ class MapFiles:
         self._offloaded.retired.kept(is_previous_complete=is_previous_complete)
 
     def retired_bytes(self) -> int:
-        """Return the size of the files that only older generations of the state need, bytes."""
+        """Return the size, in bytes, of the files that only older saved states need."""
         return self._offloaded.retired.size_bytes
 
     def unsynced_files(self) -> list[Path]:

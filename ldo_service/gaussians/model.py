@@ -147,7 +147,7 @@ class GaussianMap:
         """Append Gaussians.
 
         Args:
-            rows: [M, 16].
+            rows: Parameters, [M, 16], with the columns of the property `rows`.
             anchor: Id of the anchor keyframe of the new Gaussians.
 
         Returns:
@@ -171,8 +171,8 @@ class GaussianMap:
 
         Args:
             ids: [M], ascending and greater than all ids that this map ever had.
-            rows: [M, 16].
-            anchors: [M].
+            rows: Parameters, [M, 16], with the columns of the property `rows`.
+            anchors: Ids of the anchor keyframes, [M].
             labels: [M, 32]; None for Gaussians without observations.
 
         Raises:
@@ -182,8 +182,8 @@ class GaussianMap:
         new = _piece(ids, rows, anchors, labels)
         if len(ids) and (ids[0] < self._next_id or np.any(np.diff(ids) <= 0)):
             raise ValueError(
-                f"ids must ascend and start at {self._next_id} or above, the next unused id of "
-                f"this map. The given ids start at {ids[0]}."
+                f"ids must ascend, and the first id must be at least {self._next_id}, the next "
+                f"unused id of this map. The first id is {ids[0]}."
             )
         start, stop = self._size, self._size + len(rows)
         self._reserve(stop)
@@ -244,8 +244,8 @@ class GaussianMap:
 
         Args:
             ids: [M], in any order. This map assigned them earlier, and they are absent now.
-            rows: [M, 16].
-            anchors: [M].
+            rows: Parameters, [M, 16], with the columns of the property `rows`.
+            anchors: Ids of the anchor keyframes, [M].
             labels: [M, 32]; None for Gaussians without observations.
 
         Raises:
@@ -274,10 +274,11 @@ class GaussianMap:
     def move_anchors(self, T_new_old: Mapping[int, np.ndarray]) -> None:
         """Move the Gaussians of some anchor keyframes: mean <- T mean, quat <- q(T) quat.
 
-        The computing time is linear in the size N of the map.
+        The quaternion q(T) is the rotation of T. The computing time is linear in the size N of the
+        map.
 
         Args:
-            T_new_old: Motion T [4, 4] in the map frame by id of the anchor keyframe:
+            T_new_old: Motions T [4, 4] in the map frame, by id of the anchor keyframe. Each is
                 T_map_keyframe(new) @ inverse(T_map_keyframe(old)). Gaussians of other anchor
                 keyframes do not move.
 
@@ -290,7 +291,7 @@ class GaussianMap:
         T = np.stack([np.asarray(T_new_old[int(k)], float) for k in keyframes])
         if T.shape[1:] != (4, 4) or not np.all(np.isfinite(T)):
             raise ValueError(
-                "T_new_old must have finite transforms of shape [4, 4]; at least one is not."
+                "each transform in T_new_old must be finite with shape [4, 4]; at least one is not."
             )
         q = se3.quaternion(T[:, :3, :3])
         move_rows(self._rows[: self._size], self._anchors[: self._size], keyframes, T, q)
@@ -329,21 +330,21 @@ class GaussianMap:
 
     def _require_mask(self, mask: np.ndarray) -> None:
         if mask.shape != (self._size,) or mask.dtype != np.bool_:
-            raise ValueError(f"mask is {mask.dtype}{mask.shape}, must be bool({self._size},).")
+            raise ValueError(f"mask is {mask.dtype}{mask.shape}; it must be bool({self._size},).")
 
     def _require_absent(self, ids: np.ndarray, before: np.ndarray) -> None:
         if np.any(np.diff(ids) <= 0):
             raise ValueError("each id may be given only once; at least one is given twice.")
         if len(ids) and not (ids[0] >= 0 and ids[-1] < self._next_id):
             raise ValueError(
-                f"ids {ids[0]} to {ids[-1]} must lie in the ids of this map, 0 to "
+                f"the given ids are {ids[0]} to {ids[-1]}. All must be ids of this map, 0 to "
                 f"{self._next_id - 1}."
             )
         inside = before < self._size
         present = self.ids[before[inside]] == ids[inside]
         if np.any(present):
             raise ValueError(
-                f"ids must be new, but id {ids[inside][present][0]} is in the map already."
+                f"id {ids[inside][present][0]} is in the map already. Reinsert only absent ids."
             )
 
     def _reserve(self, size: int) -> None:
@@ -361,12 +362,14 @@ def _piece(
 ) -> GaussianBatch:
     if rows.ndim != 2 or rows.shape[1] != ROW or not len(ids) == len(anchors) == len(rows):
         raise ValueError(
-            f"rows have shape {rows.shape}, must be [M, {ROW}], with M ids and M anchors; got "
-            f"{len(ids)} ids and {len(anchors)} anchors."
+            f"rows must have shape [M, {ROW}], with M ids and M anchors. They have shape "
+            f"{rows.shape}, with {len(ids)} ids and {len(anchors)} anchors."
         )
     if not np.all(np.isfinite(rows)):
         raise ValueError("rows must be finite, but contain NaN or infinity.")
     labels = new_labels(len(ids)) if labels is None else labels
     if labels.shape != (len(ids), LABEL_BYTES) or labels.dtype != np.uint8:
-        raise ValueError(f"labels are {labels.dtype}{labels.shape}, must be uint8[M, 32].")
+        raise ValueError(
+            f"labels are {labels.dtype}{labels.shape}; they must be uint8[M, 32] for M ids."
+        )
     return GaussianBatch(ids, rows, anchors, labels)

@@ -36,11 +36,11 @@ class OffloadedGaussians:
     the motions that are not yet applied to its file. If `folder` is None, a temporary folder is
     used and removed at the end. Not thread-safe.
 
-    The folder contains the chunks of one map only. When a chunk is loaded, its file is retired: it
-    stays, since a process restored from the last snapshot would need it. It is removed once a later
-    snapshot, which does not contain the chunk, has been saved. `restore` removes all files that are
-    newer than the snapshot, and retires the others that are not in it. Without `restore`, the first
-    `put` removes all earlier files.
+    The folder contains the chunks of one map only. When a chunk is loaded, its file is retired: the
+    file stays, since a process restored from the last snapshot would need it. The file is removed
+    once a later snapshot has been saved, which does not contain the chunk. `restore` removes all
+    files newer than the snapshot, and retires older files that the snapshot does not contain.
+    Without `restore`, the first `put` removes all earlier files.
 
     Attributes:
         files: The folder of the chunks.
@@ -64,7 +64,7 @@ class OffloadedGaussians:
         return sum(entry.count for entry in self._entries.values())
 
     def numbers(self) -> list[int]:
-        """Return the numbers of the chunks, ascending."""
+        """Return the file numbers of the offloaded chunks, ascending."""
         return list(self._entries)
 
     # --- one chunk --------------------------------------------------------------------------------
@@ -72,8 +72,8 @@ class OffloadedGaussians:
         """Write a chunk to disk.
 
         Returns:
-            The number of the chunk. None if it cannot be written to disk; the caller must then keep
-            it in memory.
+            The file number of the chunk. None if the chunk cannot be written to disk; the caller
+            must then keep the chunk in memory.
 
         Raises:
             ValueError: The chunk has no Gaussians, or its ids do not ascend.
@@ -92,7 +92,7 @@ class OffloadedGaussians:
         return self._write(chunk, entry)
 
     def load(self, number: int) -> Chunk:
-        """Remove a chunk from the store and return it at the current pose of its anchor.
+        """Remove a chunk from the store and return it at the current pose of its anchor keyframe.
 
         If the file is damaged, an empty chunk is returned, and the Gaussians of the chunk are lost.
         The loss is counted and logged.
@@ -176,7 +176,7 @@ class OffloadedGaussians:
         """Move offloaded Gaussians as `GaussianMap.move_anchors` moves those in memory.
 
         Args:
-            T_new_old: Motion [4, 4] in the map frame by id of the anchor keyframe.
+            T_new_old: Motions [4, 4] in the map frame, by id of the anchor keyframe.
         """
         for number, entry in self._entries.items():
             if entry.anchor in T_new_old:
@@ -189,7 +189,7 @@ class OffloadedGaussians:
     def chunks(self) -> Iterator[Chunk]:
         """Yield all offloaded Gaussians, one anchor keyframe after the other; ids ascend.
 
-        Only the Gaussians of one anchor keyframe are in memory at a time.
+        To save memory, the files of only one anchor keyframe are read at a time.
         """
         by_anchor: dict[int, list[int]] = {}
         for number in sorted(self._entries, key=lambda n: self._entries[n].first_id):
@@ -306,7 +306,7 @@ class OffloadedGaussians:
             if (chunk.anchor, len(chunk.ids)) != (entry.anchor, entry.count):
                 raise DataError(
                     f"file {number} holds {len(chunk.ids)} Gaussians of anchor keyframe "
-                    f"{chunk.anchor}, expected {entry.count} of {entry.anchor}"
+                    f"{chunk.anchor} instead of {entry.count} of anchor keyframe {entry.anchor}"
                 )
         except DataError as error:
             self._lose(number, str(error))
@@ -366,8 +366,8 @@ def iter_all_gaussians(
 ) -> Iterator[GaussianBatch]:
     """Yield all Gaussians, those in memory and those on disk, in batches with ascending ids.
 
-    The Gaussians of one anchor keyframe must have consecutive ids. Only the offloaded Gaussians of
-    one anchor keyframe are in memory at a time.
+    The Gaussians of one anchor keyframe must have consecutive ids. To save memory, the files of
+    only one anchor keyframe are read at a time.
     """
     resident, start = gaussians.all(), 0
     for chunk in offloaded.chunks():

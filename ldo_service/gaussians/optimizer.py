@@ -86,7 +86,7 @@ class GaussianOptimizerConfig:
                     "rotation_rate_rad",
                     "translation_rate_m",
                 )
-                + ": rates and weights must be at least 0, exposure_share must lie in 0..1."
+                + ": rates and weights must be at least 0, and exposure_share must lie in 0..1."
             )
         if self.usual_reach < 1:
             raise ConfigError(named(self, "usual_reach") + " must be at least 1.")
@@ -102,7 +102,7 @@ class GaussianOptimizerConfig:
 
     @property
     def refines_poses(self) -> bool:
-        """True if keyframe poses are optimized too: one of their learning rates is above 0."""
+        """True if a learning rate of keyframe poses is above 0, so that poses are optimized too."""
         return self.rotation_rate_rad > 0 or self.translation_rate_m > 0
 
 
@@ -123,16 +123,16 @@ class IterationResult:
 
 
 class GaussianOptimizer:
-    """Optimizer of Gaussians, exposures and keyframe poses; moments persist between calls.
+    """Optimizer of Gaussians, exposures and keyframe poses; Adam moments persist between calls.
 
     A plan is the sequence of keyframes for which `optimize` does one iteration each. The same map,
     training views and plan give bitwise equal results for any number of threads. If a GPU fails,
-    the CPU runs the current plan again and continues with all later ones. Not thread-safe.
+    the CPU runs the current plan again, and all later plans. Not thread-safe.
 
     Args:
         config: Settings.
         threads: Number of threads.
-        backend: Computation of the iterations; None for that of `config.device`.
+        backend: Backend that runs the iterations; None to choose it by `config.device`.
 
     Attributes:
         device: Device of the iterations, with the reason for its choice.
@@ -181,14 +181,15 @@ class GaussianOptimizer:
             views: Training views by keyframe.
             plan: Keyframes, in the order of the iterations.
             rates: Factors on the learning rates at the first and at the last iteration; they change
-                geometrically in between. Use 1 while the map grows, less to converge at the end.
+                geometrically in between. Use 1 while the map grows. At the end of a run, use less
+                than 1, so that the map converges.
             fixed: Keyframe whose pose and exposure stay constant, to fix the pose and the
                 brightness of the map. With None, no keyframe stays constant.
-            effort: Limit of the computing time, in iterations with `usual_reach` visible Gaussians.
-                An iteration with r times as many visible Gaussians counts as (1 + r) / 2, and at
-                half resolution as HALF_EFFORT times that. No iteration starts once the sum has
-                reached `effort`.
-            starts_half: Spend the fraction `half_share` of `effort` at half resolution first.
+            effort: Limit of the computing time. The unit is the time of an iteration at full
+                resolution with `usual_reach` visible Gaussians. An iteration with r times as many
+                counts as (1 + r) / 2. At half resolution, this value is multiplied by HALF_EFFORT.
+                No iteration starts once the sum has reached `effort`.
+            starts_half: Start at half resolution, for the fraction `half_share` of `effort`.
             observe: Function that is called after each iteration with the keyframe and the visible
                 Gaussians; None for none.
             is_usable: Function that returns whether the map may be fitted to a keyframe now. It is
@@ -335,11 +336,11 @@ class GaussianOptimizer:
         return self._backend.steps(gaussians)
 
     def forget_view(self, keyframe: int) -> None:
-        """Drop the moments of a keyframe that will not be optimized again."""
+        """Drop the Adam moments of a keyframe whose pose will not be optimized again."""
         self._poses.forget(keyframe)
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """Return a copy of all moments as named arrays."""
+        """Return a copy of all Adam moments as named arrays."""
         return self._backend.snapshot() | self._poses.snapshot()
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:

@@ -1,4 +1,4 @@
-"""Backends of the Gaussian optimizer: the computation of its iterations."""
+"""Backends that run the iterations of the Gaussian optimizer: interface and CPU backend."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -23,7 +23,7 @@ class ShapeLimits:
     Attributes:
         needle_weight: Weight of the penalty on needle-shaped Gaussians; see `Rasterizer.gradients`.
         max_needle_ratio: Ratio of the longest to the middle axis above which the penalty applies.
-        max_sigma_px: Longest standard deviation after a step, in pixels of the full image.
+        max_sigma_px: Largest standard deviation after a step, in pixels of the full image.
     """
 
     needle_weight: float
@@ -32,15 +32,16 @@ class ShapeLimits:
 
 
 class OptimizerBackend(Protocol):
-    """Interface of the computation of iterations.
+    """Interface of a backend that runs the iterations of the Gaussian optimizer.
 
-    The optimizer calls `begin`, then `render`, `estimate_exposure` and `descend` for each
-    iteration, and then `end`. In between, only the backend reads or writes the rows of the map.
+    The optimizer calls `begin` first. It calls `render`, `estimate_exposure` and `descend` for each
+    iteration, and `end` last. From `begin` to `end`, only the backend reads or writes the rows of
+    the map.
 
     Attributes:
-        can_fail: Whether the methods from `begin` to `end` may raise DeviceError. The map and the
-            moments are then as they were at `begin`, and the visible Gaussians of all iterations
-            stay valid.
+        can_fail: True if the methods from `begin` to `end` may raise DeviceError. After the error,
+            the map and the moments are as they were at `begin`. The results of `descend` of such a
+            backend stay valid after the next rendering.
     """
 
     can_fail: bool
@@ -64,7 +65,7 @@ class OptimizerBackend(Protocol):
         ...
 
     def render(self, view: TrainingView, *, is_half: bool) -> None:
-        """Render the map at the pose of a view, with `is_half` at half resolution."""
+        """Render the map at the pose of a view, at half resolution if `is_half` is True."""
 
     def estimate_exposure(self) -> Exposure | None:
         """Estimate the exposure of the last rendered view; see `exposure.estimate_exposure`."""
@@ -80,18 +81,18 @@ class OptimizerBackend(Protocol):
             rate: Factor on all learning rates.
 
         Returns:
-            Loss before the step, and the visible Gaussians, which are valid until the next
-            rendering. Blending weights are sums over the pixels of the full image; those of a
-            rendering at half resolution are multiplied by 4.
+            Loss before the step, and the visible Gaussians. If `can_fail` is False, these are valid
+            only until the next rendering. Blending weights are sums over the pixels of the full
+            image: after a rendering at half resolution, the sums are multiplied by 4.
         """
         ...
 
     def steps(self, gaussians: GaussianMap) -> np.ndarray:
-        """Return the number of Adam steps of each Gaussian, [N] int32, after `end`."""
+        """Return the number of Adam steps of each Gaussian, [N] int32. Call it only after `end`."""
         ...
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """Return a copy of the moments as named arrays, in a format common to all backends."""
+        """Return a copy of the Adam moments as named arrays, in a format common to all backends."""
         ...
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
@@ -99,7 +100,7 @@ class OptimizerBackend(Protocol):
 
 
 class CpuBackend:
-    """Iterations in C++.
+    """Backend that runs the iterations of the Gaussian optimizer on the CPU, in C++.
 
     The results are bitwise equal for any number of threads.
 

@@ -1,4 +1,4 @@
-"""Attempt to run a plan of the optimizer on a device that may fail in between."""
+"""Attempt to run a plan of iterations on a device that may fail before the plan ends."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -22,14 +22,15 @@ class Views(Protocol):
 
 
 class PlanAttempt:
-    """Access to the views and the observer of a plan that can be undone if the device fails.
+    """Attempt to run a plan of iterations; `undo` reverses it after the device has failed.
 
-    A changed view is written to `views` immediately, and `undo` restores it. The observer receives
-    nothing before `commit`.
+    The iterations read and write the training views through this object. A changed view is written
+    to `views` immediately, and `undo` restores it. The observer is called only by `commit`.
 
     Args:
         views: Training views by keyframe.
-        observe: Observer of the plan; None for none.
+        observe: Function to call with the keyframe and the visible Gaussians of each iteration;
+            None for none.
     """
 
     def __init__(self, views: Views, observe: Observer | None) -> None:
@@ -46,18 +47,18 @@ class PlanAttempt:
         self._views[keyframe] = view
 
     def observe(self, keyframe: int, visible: VisibleGaussians) -> None:
-        """Keep an observation for `commit`."""
+        """Store the visible Gaussians of an iteration until `commit` or `undo`."""
         if self._observer is not None:
             self._observed.append((keyframe, visible))
 
     def commit(self) -> None:
-        """Pass all observations to the observer."""
+        """Call the observer with all stored observations."""
         for keyframe, visible in self._observed:
             assert self._observer is not None
             self._observer(keyframe, visible)
 
     def undo(self) -> None:
-        """Restore poses and exposures of the views, and drop the observations."""
+        """Restore poses and exposures of the views, and drop the stored observations."""
         self._observed.clear()
         for keyframe, (T_map_camera, exposure) in self._before.items():
             view = self._views[keyframe]

@@ -22,10 +22,11 @@ class PoseAdam:
 
         Args:
             keyframe: Id of the keyframe.
-            gradient: dL/dxi of the pose T exp(xi), [6]: rotation rad, translation m.
+            gradient: Derivative of the loss by xi at xi = 0, [6], for the pose T exp(xi). The
+                vector xi is a rotation in rad, then a translation in meters.
 
         Returns:
-            Direction, [6]. The step is this direction times the negative learning rates.
+            Direction, [6]. The step of xi is this direction times the negative learning rates.
         """
         mean, square, steps = self._moments.setdefault(keyframe, np.zeros((3, WIDTH)))
         steps += 1

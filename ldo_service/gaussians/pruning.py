@@ -38,12 +38,12 @@ class PruningConfig:
         if self.confirm_keyframes < 1 or not self.min_weight_px >= 0:
             raise ConfigError(
                 named(self, "confirm_keyframes", "min_weight_px")
-                + ": confirm_keyframes must be at least 1, min_weight_px at least 0."
+                + ": confirm_keyframes must be at least 1, and min_weight_px at least 0."
             )
         if not (self.max_relative_scale > 1 and self.neighborhood_m > 0):
             raise ConfigError(
                 named(self, "max_relative_scale", "neighborhood_m")
-                + ": max_relative_scale must exceed 1, neighborhood_m must be positive."
+                + ": max_relative_scale must exceed 1, and neighborhood_m must be positive."
             )
 
 
@@ -54,7 +54,7 @@ def prunable_mask(rows: np.ndarray, config: PruningConfig | None = None) -> np.n
     axis of the other Gaussians in its cube of edge `neighborhood_m`.
 
     Args:
-        rows: [N, 16].
+        rows: Gaussians, [N, 16]; see `GaussianMap`.
         config: Criteria.
 
     Returns:
@@ -85,16 +85,16 @@ def _mean_around(means: np.ndarray, values: np.ndarray, edge_m: float) -> np.nda
 
 
 def weights(rows: np.ndarray) -> np.ndarray:
-    """Return, for each Gaussian of `rows` [N, 16], its approximate contribution to an image, [N].
+    """Return the approximate contribution [N] of each Gaussian in `rows` [N, 16] to an image.
 
-    The contribution is the opacity times the product of the two larger standard deviations, m^2.
+    The contribution is the opacity times the product of the two largest standard deviations, m^2.
     """
     log_scales = rows[:, 3:6]
     return _opacities(rows) * np.exp(log_scales.sum(axis=1) - log_scales.min(axis=1))
 
 
 def weightiest(rows: np.ndarray, most: int) -> np.ndarray:
-    """Return a mask [N] bool of at most `most` rows: those with the largest `weights`."""
+    """Return the mask [N] bool of the `most` rows with the largest `weights`; all if N <= most."""
     mask = np.ones(len(rows), bool)
     if len(rows) > most:
         mask[np.argsort(weights(rows), kind="stable")[: len(rows) - most]] = False
@@ -130,25 +130,26 @@ class DeduplicationConfig:
         if min(self.off_m, self.reach_sigmas, self.max_color) <= 0 or not 0 <= self.min_cosine <= 1:
             raise ConfigError(
                 named(self, "off_m", "reach_sigmas", "min_cosine", "max_color")
-                + ": off_m, reach_sigmas and max_color must be positive, min_cosine must lie in "
-                "0..1."
+                + ": off_m, reach_sigmas and max_color must be positive, and min_cosine must lie "
+                "in 0..1."
             )
 
 
 def find_duplicates(
     rows: np.ndarray, anchors: np.ndarray, keyframe: int, config: DeduplicationConfig | None = None
 ) -> np.ndarray:
-    """Return the mask of Gaussians of a keyframe that duplicate much older ones.
+    """Return the mask of the Gaussians of a keyframe that duplicate much older Gaussians.
 
     A duplicate lies within `off_m` of the plane of an older, flat Gaussian. Along that plane, it
-    lies within `reach_sigmas` of the center of the older Gaussian. Both have similar normals and
-    colors. The older Gaussian is kept, since it was optimized longer together with its neighbors.
+    lies within `reach_sigmas` standard deviations of the center of the older Gaussian. Both have
+    similar normals and colors. The older Gaussian is not in the mask, since it was optimized longer
+    together with its neighbors.
 
     Only Gaussians near those of the keyframe are compared. Apart from one pass over all means, the
     computing time does not grow with the map.
 
     Args:
-        rows: [N, 16], see `GaussianMap`.
+        rows: Gaussians, [N, 16]; see `GaussianMap`.
         anchors: Ids of the anchor keyframes, [N].
         keyframe: Id of the keyframe.
         config: Criteria.

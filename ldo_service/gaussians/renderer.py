@@ -47,7 +47,7 @@ class AdamStep:
 
 @dataclass(frozen=True, slots=True)
 class RowGradients:
-    """Derivatives of a scalar L at the last rendering.
+    """Derivatives of the loss L at the last rendering.
 
     The arrays are views of reused memory, valid until the next rendering.
 
@@ -55,7 +55,8 @@ class RowGradients:
         indices: Rows that may touch the image, [V] uint32, ascending.
         rows: dL/drow, [V, 16] float32. Column 14 is not a derivative but the blending weight of the
             Gaussian summed over the pixels. Column 15 is zero. A hidden Gaussian has only zeros.
-        xi: dL/dxi at xi = 0 of T_map_camera exp(xi), [6] float64: rotation rad, translation m.
+        xi: dL/dxi at xi = 0 for the pose T_map_camera exp(xi), [6] float64. The vector xi is a
+            rotation in rad, then a translation in meters.
     """
 
     indices: np.ndarray
@@ -73,7 +74,8 @@ class VisibleGaussians:
         indices: Rows that may touch the image, [V] uint32, ascending.
         weights: Blending weight of each Gaussian summed over the pixels, [V] float32. It is 0 for
             hidden Gaussians, which the step does not change.
-        xi: dL/dxi at xi = 0 of T_map_camera exp(xi), [6] float64: rotation rad, translation m.
+        xi: Derivative of the loss by xi at xi = 0, for the pose T_map_camera exp(xi), [6] float64.
+            The vector xi is a rotation in rad, then a translation in meters.
     """
 
     indices: np.ndarray
@@ -113,17 +115,17 @@ class Rasterizer:
             rows: Gaussians, [N, 16] float32, contiguous; the function `render` lists the columns.
             camera: Intrinsics without distortion.
             T_camera_map: [4, 4].
-            bounds: Bounds of these rows (`GaussianMap.bounds`), which save reading invisible rows.
-                None reads all rows.
+            bounds: Bounds of these rows (`GaussianMap.bounds`). With them, the renderer does not
+                read invisible rows. None reads all rows.
             tiles: [ceil(H / 16), ceil(W / 16)] uint8. Tiles with value 0 are not rendered, and
                 their pixels are zero. Pass the same array to `image_loss`, so that it ignores these
                 tiles.
-            binning: Number of full-image pixels along each side of a pixel: 1, or 2 for
-                `Camera.halved`. Splats are averaged over the pixel.
+            binning: Number of full-image pixels along each side of a rendered pixel: 1, or 2 for
+                `Camera.halved`. Splats are averaged over the rendered pixel.
 
         Returns:
-            Planes [5, H, W] float32: red, green, blue, weighted depth sum w_i z_i in meters, and
-            opacity. The next rendering overwrites them.
+            Planes [5, H, W] float32: red, green, blue, weighted depth in meters and opacity, as in
+            `Rendering`. The next rendering overwrites them.
 
         Raises:
             DataError: The camera has lens distortion.
@@ -199,8 +201,8 @@ class Rasterizer:
             step: Parameters, moments and rates.
             needle_weight: Weight of the penalty on needles; see `gradients`.
             needle_ratio: Ratio of the longest to the middle axis above which the penalty applies.
-            max_sigma_px: Limit on the standard deviations of each Gaussian that the step changes,
-                in pixels at the depth of its mean.
+            max_sigma_px: Largest standard deviation of a Gaussian after the step, in pixels at the
+                depth of its mean. Gaussians that the step does not change are not limited.
 
         Raises:
             ValueError: `step.rows` are not the rows of the last rendering, or an earlier step has
@@ -257,8 +259,7 @@ class Contributions:
         indices: Rows with a weight above 0, [V] uint32, ascending.
         weights: Blending weight w_i summed over the pixels, [V] float32.
         top: Row with the largest w_i at each pixel, [H, W] int32. If several w_i are equal, the
-            nearest Gaussian counts. -1 if no Gaussian touches the pixel. An image of labels is
-            `np.where(top >= 0, labels[top], nothing)`.
+            nearest Gaussian counts. The value is -1 if no Gaussian touches the pixel.
     """
 
     indices: np.ndarray
@@ -268,13 +269,16 @@ class Contributions:
 
 @dataclass(frozen=True, slots=True)
 class Rendering:
-    """Rendering of the map, with w_i = alpha_i prod_{j<i} (1 - alpha_j), near to far.
+    """Rendering of the map: color, depth and opacity.
+
+    The Gaussians i at a pixel are ordered from near to far. They have opacity alpha_i, color c_i,
+    depth z_i and blending weight w_i = alpha_i prod_{j<i} (1 - alpha_j).
 
     Attributes:
         color: sum w_i c_i, [H, W, 3] float32; the background is black.
         weighted_depth_m: sum w_i z_i, [H, W] float32; not divided by the opacity.
-        median_depth_m: z at which the transmittance falls below one half, [H, W] float32; 0 if it
-            does not. The median lies on a surface, while the mean may lie between two surfaces.
+        median_depth_m: Depth at which the transmittance falls below one half, [H, W] float32; 0 if
+            it stays higher. The median lies on a surface, while the mean may lie between surfaces.
         opacity: sum w_i = 1 - transmittance, [H, W] float32.
         contributions: Contributions of the Gaussians, if requested.
     """
@@ -287,7 +291,7 @@ class Rendering:
 
     @property
     def depth_m(self) -> np.ndarray:
-        """Mean depth [H, W] in meters, 0 where the opacity is at most 0.5; not cached."""
+        """Mean depth [H, W] in meters, 0 where the opacity is at most 0.5; not stored."""
         covered = self.opacity > 0.5
         return np.where(covered, self.weighted_depth_m / np.where(covered, self.opacity, 1), 0)
 
@@ -304,9 +308,12 @@ def render(
 ) -> Rendering:
     """Render Gaussians into a pinhole camera.
 
-    Each pixel blends, by increasing (z, index), alpha = min(0.99, o exp(-d' S^-1 d / 2)) with
-    S = J R Sigma R' J' + 0.3 px^2 I. Gaussians with z < 0.05 m or alpha < 1/255 are skipped.
-    A block of 4x4 pixels is finished when all its transmittances are below 1e-4.
+    Each pixel blends the Gaussians by increasing depth z, and by index at equal z. A Gaussian has
+    alpha = min(0.99, o exp(-d' S^-1 d / 2)) with S = J R Sigma R' J' + 0.3 px^2 I. Here o is the
+    opacity, d the offset from the projected mean in pixels, and Sigma the covariance in the map
+    frame. R is the rotation of `T_camera_map`, and J the Jacobian of the projection.
+    Gaussians with z < 0.05 m or alpha < 1/255 are skipped. A block of 4x4 pixels is finished when
+    all its transmittances are below 1e-4.
 
     The result is bitwise equal for any number of threads; the last bits differ between
     instruction sets (`ldo_service.kernels.isa`).
@@ -314,14 +321,14 @@ def render(
     Zwicker et al., EWA splatting, 2002; Kerbl et al., 3D Gaussian splatting, 2023.
 
     Args:
-        rows: [N, 16] float32, contiguous: mean [3] in meters (map), log scale [3] in log meters,
-            quaternion wxyz [4] of any length, opacity logit, rgb [3], 2 unused. Rows that hold NaN
-            or infinity are not rendered.
+        rows: [N, 16] float32, contiguous. The columns are: mean in the map frame [3], meters;
+            logarithms of the standard deviations in meters [3]; quaternion wxyz [4] of any length;
+            opacity logit; RGB [3] in 0..1; 2 unused. Rows with NaN or infinity are not rendered.
         camera: Intrinsics without distortion.
         T_camera_map: [4, 4].
         threads: Threads of the kernel.
-        bounds: Bounds of these rows (`GaussianMap.bounds`). They save reading invisible rows and do
-            not change the result.
+        bounds: Bounds of these rows (`GaussianMap.bounds`). With them, the renderer does not read
+            invisible rows. The result is the same.
         memory: Scratch memory to reuse in several calls, which saves the time of its allocation.
             Only one call may use it at a time.
         contributions: Also compute the contributions of the Gaussians, which takes about 50 % more

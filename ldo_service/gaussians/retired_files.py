@@ -1,4 +1,4 @@
-"""Files that only older states need, until no such state can be restored any more."""
+"""Files that only saved states need, and their removal once no saved state needs them."""
 
 from ldo_service.storage.checksummed_folder import ChecksummedFolder
 
@@ -6,9 +6,9 @@ from ldo_service.storage.checksummed_folder import ChecksummedFolder
 class RetiredFiles:
     """Files that the current state does not need any more, but that a saved state may need.
 
-    The saved states are the last one and, if they are kept, its older generations. The service
-    falls back to an older generation if the last state is damaged. A file is given by its number in
-    the folder.
+    The last saved state always counts. Older saved states, called generations, count too if the
+    service keeps them. The service restores an older generation if the last state is damaged. A
+    file is given by its number in the folder.
     """
 
     def __init__(self, files: ChecksummedFolder) -> None:
@@ -18,7 +18,7 @@ class RetiredFiles:
         self._kept: list[int] = []  # The newest kept generation does not need them.
 
     def add(self, number: int) -> None:
-        """Remove a file as soon as no saved state needs it.
+        """Mark a file for removal as soon as no saved state needs it.
 
         A file in a temporary folder is removed at once, because no restored process uses it.
         """
@@ -28,39 +28,40 @@ class RetiredFiles:
             self._new.append(number)
 
     def on_snapshot(self) -> None:
-        """Record that a snapshot was taken, which needs none of the files added before it."""
+        """Record that a snapshot was taken; the snapshot needs none of the files added so far."""
         self._unsaved, self._new = [*self._unsaved, *self._new], []
 
     def restart(self, numbers: list[int]) -> None:
         """Forget all files, and start with those that a restored state does not need.
 
         Args:
-            numbers: Numbers of these files.
+            numbers: Numbers of the files that the restored state does not need.
         """
         self._new, self._unsaved, self._kept = [], numbers, []
 
     @property
     def size_bytes(self) -> int:
-        """Size of the files that the last snapshot does not need, bytes."""
+        """Size, in bytes, of the files that the last snapshot does not need."""
         return sum(self._files.sizes.get(n, 0) for n in (*self._unsaved, *self._kept))
 
     def saved(self) -> None:
         """Remove the files that the last snapshot does not need.
 
-        Call this method once that snapshot is saved, if no older states are kept.
+        Call this method after that snapshot was saved. If older generations of the state are kept,
+        call `kept` instead.
         """
         self._remove(self._kept)
         self._remove(self._unsaved)
 
     def kept(self, *, is_previous_complete: bool) -> None:
-        """Remove the files that no kept generation of the state needs.
+        """Remove the files that no kept generation (older version) of the saved state needs.
 
-        If older generations are kept, call this method, instead of `saved`, after the state was
-        saved as a new generation.
+        If older generations are kept, call this method instead of `saved`. Call it after the state
+        was saved as a new generation.
 
         Args:
-            is_previous_complete: True if the generation before the new one is complete, so that no
-                older one is needed.
+            is_previous_complete: True if the generation before the new one is complete. No older
+                generation is needed then.
         """
         if is_previous_complete:
             self._remove(self._kept)

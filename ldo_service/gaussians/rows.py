@@ -35,8 +35,8 @@ def move_rows(
     every machine.
 
     Args:
-        rows: [M, 16].
-        anchors: Anchor keyframe of each row, [M] int32.
+        rows: Gaussians, [M, 16]; `ROW` lists the columns.
+        anchors: Id of the anchor keyframe of each row, [M] int32.
         keyframes: Ids of the moved keyframes, [K] int64, ascending. Rows of other anchors stay.
         T: Motions T_new_old of these keyframes in the map frame, [K, 4, 4].
         q: Rotations of these transforms, [K, 4] wxyz.

@@ -1,4 +1,4 @@
-"""Training views: keyframes that the map is optimized against, and their choice per iteration.
+"""Training views (keyframes that the map is optimized against) and their random choice.
 
 The images of a training view never change and are stored as compressed bytes.
 """
@@ -55,8 +55,8 @@ class TrainingView:
     def halved(self) -> "TrainingView":
         """Return the view at half resolution; each pixel averages a block of 2x2 pixels.
 
-        A block has a depth if all of its pixels have one. The average includes all surfaces of the
-        block, like the depth of a rendering. A block is masked if any of its pixels is masked.
+        A block has a depth if all of its pixels have one. Depths of different surfaces in a block
+        are averaged, as in a rendered depth image. A block is ignored if one of its pixels is.
         """
         camera = self.camera.halved()
         size = (camera.width, camera.height)
@@ -101,12 +101,12 @@ def covisibility_ratio(p_map: np.ndarray, camera: Camera, T_map_camera: np.ndarr
 def visible_in_mask(
     pixels: np.ndarray, p_map: np.ndarray, camera: Camera, T_map_camera: np.ndarray
 ) -> np.ndarray:
-    """Return the mask [M] of the points that project into masked pixels.
+    """Return which points project into selected pixels, [M] bool.
 
     Occlusion is ignored, so points behind the surface count too.
 
     Args:
-        pixels: Mask, [H, W] bool.
+        pixels: Selected pixels, [H, W] bool.
         p_map: Points in the map frame, [M, 3].
         camera: Intrinsics.
         T_map_camera: Camera pose, [4, 4].
@@ -192,8 +192,8 @@ class KeyframeImages:
     def _require(self, name: str, image: np.ndarray, dtype: type, shape: tuple[int, ...]) -> None:
         if image.dtype != dtype or image.shape != shape:
             raise DataError(
-                f"keyframe {self.keyframe}: {name} is {image.dtype}{image.shape}, must be "
-                f"{np.dtype(dtype)}{shape} for its camera."
+                f"keyframe {self.keyframe}: {name} is {image.dtype}{image.shape}, expected "
+                f"{np.dtype(dtype)}{shape}. Use this type and the camera's image size."
             )
 
     @classmethod
@@ -202,7 +202,10 @@ class KeyframeImages:
         return cls(view.keyframe, view.camera, view.color, view.depth_m, view.mask)
 
     def view(self, T_map_camera: np.ndarray, exposure: Exposure | None = None) -> TrainingView:
-        """Return the training view with a pose [4, 4] and an exposure; None is gain 1, bias 0."""
+        """Return these images as a training view with a pose [4, 4] and an exposure.
+
+        If `exposure` is None, the gain is 1 and the bias is 0.
+        """
         return TrainingView(
             self.keyframe,
             self.camera,
@@ -222,7 +225,7 @@ class KeyframeImages:
     def owned(self) -> "KeyframeImages":
         """Return read-only copies of the images.
 
-        The originals may be views of a received message, which would stay in memory as a whole.
+        The originals may share the memory of a received message, and would keep it allocated.
         """
         mask = None if self.mask is None else _own(self.mask)
         return replace(self, color=_own(self.color), depth_m=_own(self.depth_m), mask=mask)
@@ -273,7 +276,7 @@ def unpack(body: bytes | memoryview) -> KeyframeImages:
         mask = None if stored.mask is None else _expanded(stored.mask, np.uint8, size)
     except (zstandard.ZstdError, ValueError, RecursionError) as error:
         raise DataError(
-            f"{len(body)} bytes cannot be decoded as the images of a keyframe: {error}"
+            f"data of {len(body)} bytes cannot be decoded as the images of a keyframe: {error}"
         ) from error
     for image in (color, depth_m, mask):
         if image is not None:
@@ -338,5 +341,7 @@ def _expanded(data: bytes, dtype: type, shape: tuple[int, ...]) -> np.ndarray:
         filled = stream.readinto(out.reshape(-1).view(np.uint8).data)
         if filled < out.nbytes or stream.read(1):
             size = f"only {filled}" if filled < out.nbytes else "more"
-            raise ValueError(f"an image {shape} has {out.nbytes} bytes, but the data has {size}")
+            raise ValueError(
+                f"an image of shape {shape} needs {out.nbytes} bytes, but the data contains {size}"
+            )
     return out

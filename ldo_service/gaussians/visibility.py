@@ -1,6 +1,7 @@
-"""Conservative visibility of Gaussians from cameras, and the choice of Gaussians to offload.
+"""Visibility of Gaussians in cameras, and the choice of Gaussians to offload to disk.
 
-Bounding spheres and a coarse depth grid decide whether Gaussians may be visible.
+The visibility test compares bounding spheres with a coarse depth grid. It is conservative: it never
+reports a visible Gaussian as hidden, but may report a hidden Gaussian as visible.
 """
 
 from collections.abc import Sequence
@@ -44,7 +45,7 @@ class MaxDepthGrid:
 
     @classmethod
     def of(cls, depth_m: np.ndarray) -> "MaxDepthGrid":
-        """Return the grid of a depth image [H, W] float32, 0 where not measured."""
+        """Return the grid of a depth image in meters, [H, W] float32; 0 means "not measured"."""
         filled_m = with_small_holes_filled(depth_m, _HOLE_PX)
         known_m = np.where(filled_m > 0, filled_m, np.float32(inf))
         for axis, edges in enumerate(_edges(depth_m.shape)):
@@ -56,17 +57,17 @@ class MaxDepthGrid:
     ) -> np.ndarray:
         """Return which spheres lie completely behind the measured surface.
 
-        The result is True if the sphere is behind the surface in every block that it may touch. It
-        is conservative: never True for a visible sphere, but False for some hidden spheres. It is
-        False for spheres with NaN.
+        A sphere counts as hidden if it lies behind the farthest depth of every image block that the
+        sphere may touch. The test is conservative: visible spheres never count as hidden, but some
+        hidden spheres count as visible. Spheres with NaN count as visible.
 
         Args:
             camera: Intrinsics.
-            centers_camera: Centers in the camera frame, [K, 3].
+            centers_camera: Centers in the camera frame, [K, 3] meters.
             radii_m: Radii, [K].
 
         Returns:
-            Mask [K] bool.
+            [K] bool; True for hidden spheres.
         """
         downward, rightward = _edges((camera.height, camera.width))
         rows = _between(centers_camera[:, 1:], radii_m, downward, camera.fy, camera.cy)
@@ -129,7 +130,10 @@ class PlacedCamera:
     horizon: MaxDepthGrid | None = None
 
     def distances_m(self, centers_map: np.ndarray, radii_m: np.ndarray) -> np.ndarray:
-        """Return the distances in meters from the camera to K spheres, [K]; negative if inside."""
+        """Return the distances [K] in meters from the camera to the surfaces of spheres.
+
+        A distance is negative if the camera is inside the sphere.
+        """
         return np.linalg.norm(centers_map - self.T_map_camera[:3, 3], axis=1) - radii_m
 
     def may_see(
@@ -137,17 +141,17 @@ class PlacedCamera:
     ) -> np.ndarray:
         """Return which spheres the camera may see.
 
-        These are the spheres that touch the view frustum and do not lie behind `horizon`. The
-        result is conservative: never False for a visible sphere, but True for some invisible
-        spheres. It is True for spheres with NaN.
+        A sphere counts as visible if it touches the view frustum and is not hidden by the surface
+        that the camera measured. The test is conservative: visible spheres never count as
+        invisible, but some invisible spheres count as visible. Spheres with NaN count as visible.
 
         Args:
-            centers_map: Centers in the map frame, [K, 3].
+            centers_map: Centers in the map frame, [K, 3] meters.
             radii_m: Radii, [K].
-            reach_m: Distance beyond which spheres count as invisible.
+            reach_m: Distance in meters beyond which spheres count as invisible.
 
         Returns:
-            Mask [K] bool.
+            [K] bool; True for visible spheres.
         """
         centers = se3.transform(se3.inverse(self.T_map_camera), centers_map)
         beside = np.any(centers @ self._sides().T < -radii_m[:, None], axis=1)
@@ -176,10 +180,14 @@ class PlacedCamera:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BoundingSpheres:
-    """Bounding spheres of K chunks; each contains the rendered extent of the Gaussians of a chunk.
+    """Bounding spheres of K chunks of Gaussians.
+
+    The Gaussians of a chunk move with the same keyframe, called their anchor keyframe. The sphere
+    of a chunk contains its Gaussians to the extent to which they are rendered.
 
     Attributes:
-        anchors: Id of the anchor keyframe of each chunk, [K]; several chunks may have the same.
+        anchors: Id of the anchor keyframe of each chunk, [K]. Several chunks may share one
+            anchor keyframe.
         counts: Number of Gaussians in each chunk, [K].
         centers: Centers in the map frame, [K, 3].
         radii_m: Radii, [K].
@@ -197,10 +205,10 @@ class BoundingSpheres:
         """Return a sphere for each chunk of Gaussians, in the order of the chunk numbers.
 
         Args:
-            rows: [N, 16].
-            anchors: [N].
-            chunks: Chunk numbers [N], see `chunk_numbers`. None makes one chunk for each anchor
-                keyframe.
+            rows: Parameters of the Gaussians, [N, 16].
+            anchors: Id of the anchor keyframe of each Gaussian, [N].
+            chunks: Chunk number of each Gaussian, [N], from `chunk_numbers`. If it is None, the
+                Gaussians of each anchor keyframe form one chunk.
         """
         chunks = anchors if chunks is None else chunks
         order = np.argsort(chunks, kind="stable")
@@ -217,11 +225,11 @@ def chunk_numbers(means: np.ndarray, anchors: np.ndarray, edge_m: float) -> np.n
     """Return the chunk number of each Gaussian, [N].
 
     A chunk contains the Gaussians of one anchor keyframe in one cube of the map. Chunk numbers
-    ascend with the ids of the anchor keyframes. Cubes that are a multiple of 1024 cubes apart on an
-    axis are not distinguished.
+    ascend with the ids of the anchor keyframes. Positions of cubes are taken modulo 1024 cubes on
+    each axis, so cubes 1024 apart count as one.
 
     Args:
-        means: [N, 3], meters.
+        means: Centers of the Gaussians in the map frame, [N, 3], meters.
         anchors: Ids of the anchor keyframes, [N].
         edge_m: Edge of the cubes, meters.
     """
@@ -256,7 +264,7 @@ def _spheres(
 
 @dataclass(frozen=True, slots=True)
 class OffloadConfig:
-    """Settings of offloading: when Gaussians leave the memory, and which of them."""
+    """Settings of offloading, which moves Gaussians from memory to disk."""
 
     # Largest number of Gaussians in memory; with the moments of Adam, they take 300 MB. The
     # limit is checked every mapper.publish.update_interval_keyframes keyframes. Until then, new
@@ -287,10 +295,10 @@ class OffloadConfig:
 
 @dataclass(frozen=True, slots=True)
 class OffloadPlan:
-    """Choice of the chunks to offload.
+    """Choice of the chunks of Gaussians to offload from memory to disk.
 
     Attributes:
-        chunks: Numbers of the chunks to offload, the farthest first.
+        chunks: Numbers of the chunks to offload, the farthest from the current camera first.
         excess: Number of Gaussians in memory beyond `max_active` after offloading. They stay
             because recent cameras may see them.
     """
@@ -304,9 +312,9 @@ def plan_offload(
     recent: Sequence[PlacedCamera],
     config: OffloadConfig,
 ) -> OffloadPlan:
-    """Choose the chunks to offload if more than `max_active` Gaussians are in memory.
+    """Choose the chunks to offload to disk if more than `max_active` Gaussians are in memory.
 
-    Chunks are chosen until the fraction `low_water` of `max_active` stays in memory. Only chunks
+    Chunks are chosen until at most `low_water * max_active` Gaussians stay in memory. Only chunks
     that no recent camera may see are chosen, the farthest from the current camera first. At the
     same distance, chunks of older anchor keyframes are chosen first. Chunks of the newest anchor
     keyframe always stay. The choice is deterministic.
@@ -314,7 +322,7 @@ def plan_offload(
     Args:
         resident: Bounding spheres of all Gaussians in memory, by chunk.
         recent: Cameras of the last keyframes, at least one; the last one is the current camera.
-        config: Limits.
+        config: Settings, which include `max_active` and `low_water`.
     """
     active = int(resident.counts.sum())
     if active <= config.max_active:

@@ -33,14 +33,15 @@ def non_maximum_suppression(
     """Return the indices of the boxes to keep, highest score first.
 
     The search is greedy: a box is dropped if its intersection over union with a kept box of its
-    class exceeds `max_iou`. Boxes of equal scores are processed in the order of the arguments.
+    class exceeds `max_iou`. Boxes of equal scores are processed in the order of `boxes`.
 
     Args:
         boxes: Boxes, [M, 4]. If there are several classes, coordinates must be above -1, because
             OpenCV separates the classes by shifting their boxes.
         scores: Scores, [M]; at least 0.
         class_ids: Classes, [M]; at least 0. Boxes of different classes never suppress each other.
-        max_iou: Largest overlap that two kept boxes may have, 0..1; compared in single precision.
+        max_iou: Largest intersection over union of two kept boxes of the same class, 0..1;
+            compared in single precision.
 
     Returns:
         Indices of the kept boxes, [K] int64.

@@ -129,7 +129,7 @@ class Camera:
         return self.rays_at(np.arange(self.width), np.arange(self.height)[:, None])
 
     def rays_at(self, u: np.ndarray | float, v: np.ndarray | float) -> np.ndarray:
-        """Return the viewing rays through pixels, without lens distortion.
+        """Return the viewing rays through pixels, ignoring lens distortion.
 
         Args:
             u: Columns in pixels; broadcast with v to [...].
@@ -145,7 +145,7 @@ class Camera:
     def points_at(
         self, u: np.ndarray | float, v: np.ndarray | float, depth_m: np.ndarray | float
     ) -> np.ndarray:
-        """Return the 3D points of pixels with depth, without lens distortion.
+        """Return the 3D points of pixels with depth, ignoring lens distortion.
 
         Args:
             u: Columns in pixels; broadcast with v to [...].
@@ -158,11 +158,25 @@ class Camera:
         return self.rays_at(u, v) * np.asarray(depth_m)[..., None]
 
     def backproject(self, depth_m: np.ndarray) -> np.ndarray:
-        """Return camera points [H, W, 3] of depth [H, W], meters; 0 0 0 where depth is 0."""
+        """Return the 3D points of a depth image, ignoring lens distortion.
+
+        Args:
+            depth_m: Depth along the optical axis, [H, W] meters; 0 where not measured.
+
+        Returns:
+            Points in the camera frame, [H, W, 3] float32 meters; (0, 0, 0) where the depth is 0.
+        """
         return (self.rays() * depth_m[..., None]).astype(np.float32)
 
     def project(self, points_camera: np.ndarray) -> np.ndarray:
-        """Return the pixel coordinates [..., 2] of camera points [..., 3] with z > 0."""
+        """Return the pixels (u, v) of points in the camera frame, ignoring lens distortion.
+
+        Args:
+            points_camera: Points with z > 0, [..., 3] meters.
+
+        Returns:
+            Pixel coordinates, [..., 2].
+        """
         z = points_camera[..., 2]
         return np.stack(
             [

@@ -48,7 +48,7 @@ class RgbdFrame:
         lowest, highest = float(self.depth_m.min()), float(self.depth_m.max())
         if not (lowest >= 0.0 and highest < MAX_DEPTH_M):  # NaN fails each comparison.
             raise FrameError(
-                f"frame {self.index}: depth of {lowest:g} to {highest:g} m must be finite, at "
+                f"frame {self.index}: depth is {lowest:g} to {highest:g} m, must be finite, at "
                 f"least 0 and below {MAX_DEPTH_M:g}. Set pixels without a measurement to 0."
             )
 
@@ -58,7 +58,7 @@ Maps = tuple[np.ndarray, np.ndarray]  # Results of `undistortion_maps`.
 
 @dataclass(frozen=True, slots=True)
 class RawFrame:
-    """Unrectified frame of a camera: color with lens distortion, and depth registered to it.
+    """Unrectified frame of a camera: color with lens distortion, and depth on its pixel grid.
 
     Raises:
         FrameError: The images, the camera and the depth scale do not fit together.
@@ -186,7 +186,7 @@ def rectify(raw: RawFrame, maps: Maps | None) -> RgbdFrame:
 
 
 class Rectifier:
-    """Function object for `rectify` that caches the undistortion maps of the last camera."""
+    """Callable that rectifies frames and caches the undistortion maps of the last camera."""
 
     def __init__(self) -> None:
         self._camera: Camera | None = None

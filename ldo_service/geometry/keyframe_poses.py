@@ -30,9 +30,9 @@ KEYFRAME = np.dtype(
 def T_map_submap(submap: int) -> np.ndarray:
     """Return the provisional pose [4, 4] of a submap that is not merged with an older one.
 
-    Unmerged submaps are placed 100 m below each other, because buildings extend mostly sideways.
-    At this distance, their surfaces do not touch. In the tenth submap, float32 coordinates still
-    resolve 0.1 mm.
+    Each submap is placed 100 m below the previous one, so that their surfaces do not touch. The
+    offset is vertical, because buildings extend mostly sideways. In the tenth submap, float32
+    coordinates still resolve 0.1 mm.
     """
     T = np.eye(4)
     T[1, 3] = submap * APART_M
@@ -128,9 +128,9 @@ class KeyframePoses:
             version: Version of the pose graph.
             T_map: Corrected T_map_keyframe [4, 4] by id.
             held: Keyframes whose stored pose relative to their reference keyframe is more accurate
-                than the relative pose in the pose graph. If the reference keyframe of such a
-                keyframe is known, its pose is computed from that of the reference keyframe.
-                Otherwise its pose is taken from `T_map`.
+                than the relative pose in the pose graph. The pose of such a keyframe is computed
+                from the pose of its reference keyframe. If the reference keyframe is unknown, the
+                pose is taken from `T_map`.
         """
         if version <= self.version or not T_map:
             return
@@ -191,11 +191,11 @@ class KeyframePoses:
         return record["T_map"] @ se3.inverse(record["T_odom"])
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the version and the records as arrays."""
+        """Return the version of the pose graph and the records of the keyframes, as arrays."""
         return {"version": self.version, **self._known.columns()}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Replace the version and the records by those of a snapshot."""
+        """Replace the graph version and the records of the keyframes by those of a snapshot."""
         self.version = state["version"]
         self._known.restore(state)
 

@@ -94,7 +94,7 @@ class RecordTable:
         self.replace_all(self.all[np.sort(np.unique(self.rows(ids)))])
 
     def replace_all(self, records: np.ndarray) -> None:
-        """Replace the table by records [N] in ascending order of their ids."""
+        """Replace the table by records [N], which must be in ascending order of their ids."""
         room = np.zeros(max(MIN_ROOM, len(records)), self._room.dtype)
         room[: len(records)] = records
         self._room, self._count = room, len(records)
@@ -148,5 +148,5 @@ class PoseTable(MutableMapping[int, np.ndarray]):
         return self._records.all["T"][self._records.rows(ids)]
 
     def become(self, ids: Collection[int], T: np.ndarray) -> None:
-        """Replace all entries by ids [n], which ascend, and their transforms T [n, 4, 4]."""
+        """Replace all entries by `ids` [n], in ascending order, and their transforms [n, 4, 4]."""
         self._records.restore({"id": np.fromiter(ids, np.int64), "T": T})

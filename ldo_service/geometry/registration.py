@@ -52,7 +52,7 @@ def register_depth(
     """
     if depth_m.shape != (depth_camera.height, depth_camera.width):
         raise FrameError(
-            f"depth is {depth_m.shape[1]}x{depth_m.shape[0]} pixels and its camera "
+            f"depth is {depth_m.shape[1]}x{depth_m.shape[0]} pixels, but its intrinsics are for "
             f"{depth_camera.width}x{depth_camera.height}. Give the intrinsics for this image size."
         )
     cell_px = max(color_camera.fx / depth_camera.fx, color_camera.fy / depth_camera.fy)
@@ -209,7 +209,7 @@ def _cover_row(nearest: np.ndarray, z: np.ndarray, pixel: np.ndarray, more: np.n
 def resample_color(
     color: np.ndarray, color_camera: Camera, depth_camera: Camera
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Resample a color image to the pixels of a depth camera of equal center and orientation.
+    """Resample a color image to the pixels of a depth camera at the same pose.
 
     To avoid aliasing, the color image is halved until its resolution is at most 1.5 times that of
     the depth image. Then the color image is interpolated bilinearly.
@@ -228,7 +228,7 @@ def resample_color(
     """
     if color.shape[:2] != (color_camera.height, color_camera.width):
         raise FrameError(
-            f"color is {color.shape[1]}x{color.shape[0]} pixels and its camera "
+            f"color is {color.shape[1]}x{color.shape[0]} pixels, but its intrinsics are for "
             f"{color_camera.width}x{color_camera.height}. Give the intrinsics for this image size."
         )
     while min(color_camera.fx / depth_camera.fx, color_camera.fy / depth_camera.fy) > 1.5:

@@ -36,9 +36,9 @@ class Stream:
 
     Attributes:
         name: Name of the topic, the track or the file.
-        kind: Type of its content.
-        messages: Number of its messages or images; None if it is not known.
-        use: What the reader takes from it, such as "color"; empty if it is not used.
+        kind: Type of the content.
+        messages: Number of messages or images in the stream; None if unknown.
+        use: Data that is read from the stream, such as "color"; empty if the stream is unused.
     """
 
     name: str
@@ -60,7 +60,8 @@ class Sequence(ABC):
         stamps_ns: Stamps, [len] int64, ascending.
         depth_offsets_ns: Stamps of the depth images minus `stamps_ns`, [len] int64; None if depth
             has no stamps of its own.
-        registration: Step that registers depth to color: the source, `read`, or none.
+        registration: "source" if depth was already registered to color, "reader" if `read`
+            registers it, "none" if it is not registered.
         streams: Streams of the recording, used or not; empty if it has only color and depth.
     """
 
@@ -92,8 +93,8 @@ class Sequence(ABC):
     def odometry(self) -> Trajectory | None:
         """Return the odometry that was recorded with the frames, `T_odom_camera`, or None.
 
-        It is an estimate, such as that of a phone or of wheels, and no ground truth. Its stamps are
-        of the clock of the frames, and the camera is that of the color images.
+        It is an estimate, such as that of a phone or of wheels, and no ground truth. Its stamps use
+        the clock of the frames. Its poses are those of the color camera.
 
         Raises:
             DataError: The recorded poses are invalid.

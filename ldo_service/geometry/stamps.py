@@ -28,7 +28,7 @@ def associate(stamps_a: np.ndarray, stamps_b: np.ndarray, tolerance: float) -> n
     Args:
         stamps_a: Stamps, [A], sorted or not.
         stamps_b: Stamps, [B], sorted or not.
-        tolerance: Maximum distance of the stamps of a pair.
+        tolerance: Maximum difference between the two stamps of a pair.
 
     Returns:
         Index pairs (a, b), [M, 2], ascending in a; each stamp occurs at most once.
@@ -69,7 +69,7 @@ B = TypeVar("B", bound=Stamped)
 
 @dataclass
 class StreamBuffer:
-    """Buffer of the measurements of one stream that have no partner yet."""
+    """Buffer of measurements of one stream that wait for a partner from another stream."""
 
     waiting: deque[Stamped] = field(default_factory=deque)  # The oldest first.
     # The newest received stamps, including those of measurements already paired or dropped.
@@ -104,24 +104,24 @@ class StreamBuffer:
 class StreamPairer(Generic[A, B]):
     """Pairing of the measurements of two live streams by nearest stamp.
 
-    A measurement is called a half of its pair. The stamps of a pair differ by at most
-    `max_skew_ns`. Pairs keep the order of both streams, and each half is used at most once.
+    The stamps of a pair differ by at most `max_skew_ns`. Pairs keep the order of both streams, and
+    each measurement is used at most once.
 
-    The pairer compares the oldest waiting halves of the two streams: an earlier and a later half.
-    The stream of the earlier half may still deliver a half that is nearer to the later half. This
-    is impossible if the two stamps differ by at most half the period of that stream. The pair is
-    then returned immediately. Otherwise the pairer waits for the next half of that stream. While
-    the period is unknown, the pairer accepts any difference up to `max_skew_ns`.
+    The pairer compares the oldest waiting measurements of the two streams. It looks at the stream
+    whose measurement is the earlier one. The next measurement of this stream comes one period
+    later. If the two stamps differ by at most half a period, the next measurement cannot be nearer,
+    so the pairer returns the pair immediately. Otherwise it waits for the next measurement. While
+    the period is unknown, any difference up to `max_skew_ns` is accepted.
 
-    At most `buffer` halves of a stream wait. If there are more, the oldest half is paired with the
-    best available half or dropped. Equal input gives equal pairs, because no clock is read.
+    At most `buffer` measurements of a stream wait. If there are more, the oldest one is paired with
+    the best available partner or dropped. Equal input gives equal pairs, because no clock is read.
 
     Args:
         max_skew_ns: Largest difference between the stamps of a pair, nanoseconds.
-        buffer: Largest number of halves of a stream that wait for a partner.
-        size_of: Function that returns the size of a half in bytes.
-        max_bytes: Largest size of the halves of a stream that wait, bytes. The newest half may
-            wait alone whatever its size.
+        buffer: Largest number of measurements of a stream that wait for a partner.
+        size_of: Function that returns the size of a measurement in bytes.
+        max_bytes: Largest total size in bytes of the waiting measurements of a stream. The newest
+            measurement may wait alone whatever its size.
 
     Raises:
         ConfigError: An argument is out of range.
@@ -145,7 +145,7 @@ class StreamPairer(Generic[A, B]):
         self.pairs = 0
 
     def add_a(self, half: A) -> Iterator[tuple[A, B]]:
-        """Add an item of the first stream, and return the pairs that it completes.
+        """Add a measurement of the first stream, and return the pairs that it completes.
 
         Raises:
             FrameError: The stamp is not later than the last stamp of the stream.
@@ -154,7 +154,7 @@ class StreamPairer(Generic[A, B]):
         return self._decided()
 
     def add_b(self, half: B) -> Iterator[tuple[A, B]]:
-        """Add an item of the second stream, and return the pairs that it completes.
+        """Add a measurement of the second stream, and return the pairs that it completes.
 
         Raises:
             FrameError: The stamp is not later than the last stamp of the stream.

@@ -12,7 +12,7 @@ try:
     from ._rasterize import isa
 except ImportError as error:
     if "LDO_ISA" in str(error):
-        raise ConfigError(f"the environment variable {error}.") from error
+        raise ConfigError(f"the environment variable LDO_ISA cannot be used: {error}.") from error
     raise
 
 __all__ = ["isa"]

@@ -51,15 +51,15 @@ def read_only_array(array: np.ndarray) -> np.ndarray:
 
 
 def rigid_transform(name: str, value: object, error: type[LdoError]) -> np.ndarray:
-    """Return a transform that a caller passed as a rigid transform [4, 4] float64.
+    """Check a transform that a caller passed, and return it as [4, 4] float64.
 
     Args:
-        name: Name of the argument, for the error.
-        value: The argument.
-        error: Type of the error.
+        name: Name of the checked argument, for the error text.
+        value: Value of the checked argument.
+        error: Type of the error to raise.
 
     Raises:
-        LdoError: The value is no rigid transform; the error has the type `error`.
+        LdoError: The value is not a rigid transform; the error has the type `error`.
     """
     try:
         T = np.asarray(value, float)

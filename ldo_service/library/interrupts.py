@@ -9,10 +9,10 @@ from types import FrameType
 
 @contextmanager
 def interrupts_delayed() -> Iterator[None]:
-    """Handle Ctrl-C after the block instead of within it, so that each step is complete.
+    """Delay Ctrl-C until the end of the `with` block, so that the step in the block is completed.
 
     A second Ctrl-C is handled immediately, because a step may hang. Only the main thread receives
-    the signal, so the block does nothing in other threads.
+    the signal, so this function has no effect in other threads.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

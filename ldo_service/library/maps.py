@@ -25,7 +25,7 @@ class MapArrays:
     Attributes:
         means_m: [N, 3], centers in meters.
         scales_m: [N, 3], standard deviations along the axes in meters.
-        quaternions: [N, 4], unit quaternions wxyz that rotate the axes.
+        quaternions: [N, 4], unit quaternions wxyz, rotation from a Gaussian's axes to the map.
         opacities: [N], 0..1.
         colors: [N, 3], RGB, mostly within 0..1.
         label_probabilities: [N, C], probabilities of the C labels of `Map.label_names`. Each row
@@ -67,7 +67,8 @@ class FoundObject:
         score: Similarity of the name to the searched text, 0..1; 1 without a text.
         T_map_object: [4, 4], center and axes of the object's box in the map.
         size_m: [3], size of the box along its axes in meters.
-        distance_m: Distance from the last camera pose to the center in meters; None without poses.
+        distance_m: Distance in meters from the last camera pose to the center of the box; None if
+            there is no camera pose.
     """
 
     id: int
@@ -141,7 +142,8 @@ class Map:
             camera: Camera of the image. Its distortion is ignored. None uses the camera of the
                 keyframes.
             labels: Also render the label of each pixel, which takes several times as long.
-            threads: Threads of the renderer; None for all cores. The images are the same.
+            threads: Number of renderer threads; None for all cores. The number does not change the
+                images.
 
         Raises:
             ConfigError: An argument is wrong, no camera is known because the map is empty, or the
@@ -185,7 +187,7 @@ def find(
     Args:
         objects: Objects of the map; None without a detector.
         text: Name or synonym of an object; None for all objects.
-        T_map_camera: Camera poses, [M, 4, 4]. Distances are from the last one.
+        T_map_camera: Camera poses, [M, 4, 4]. Object distances are measured from the last pose.
     """
     if objects is None:
         return []
@@ -211,7 +213,7 @@ def _map_pose(name: str, value: object) -> np.ndarray:
     """
     if value is None:
         raise ConfigError(
-            f"{name} is None, as for a frame that is LOST. Give the pose of a frame that is not "
-            "LOST."
+            f"{name} is None, because a frame with tracking status LOST has no pose. Give the pose "
+            "of a frame with status OK or WEAK."
         )
     return rigid_transform(name, value, ConfigError)

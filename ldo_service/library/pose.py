@@ -19,15 +19,15 @@ class Pose:
         frame: Number of the frame, counted from 0 by the calls of `Slam.track`.
         stamp_ns: Time of the exposure, ns.
         status: Tracking status: OK, WEAK (uncertain, not mapped) or LOST.
-        T_map_camera: [4, 4], camera to map, with all corrections so far. None while LOST, and in a
-            submap that is not merged with the map yet.
-        T_odom_camera: [4, 4], camera to odometry. It is continuous while the status is not LOST.
-            While LOST, it is the last pose.
+        T_map_camera: [4, 4], transform from the camera to the map, with all corrections so far.
+            None while LOST, and in a submap that is not merged with the map yet.
+        T_odom_camera: [4, 4], transform from the camera to the odometry frame. It is continuous
+            while the status is not LOST. While LOST, it stays at the last pose.
         reference: Id of the keyframe that the frame was aligned to; None before the first keyframe.
-        T_reference_camera: [4, 4], camera to this keyframe.
+        T_reference_camera: [4, 4], transform from the camera to the keyframe `reference`.
         covariance: [6, 6], covariance of T_reference_camera for a perturbation on the right:
             rotation in rad, then translation in m. Zeros if unknown.
-        keyframe: Id of the keyframe that was made of the frame; None if none was made.
+        keyframe: Id of the keyframe that this frame became; None if it became no keyframe.
         submap: Number of the submap; 0 is the map itself.
     """
 

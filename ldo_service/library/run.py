@@ -31,7 +31,8 @@ class Run:
 
         Args:
             folder: The folder.
-            online: True reads the map and the poses before the refinement, if there was one.
+            online: True opens the map and the poses from before the refinement. False opens the
+                refined ones if the run was refined.
 
         Raises:
             DataError: The folder has no map.
@@ -63,7 +64,7 @@ class Run:
         """Return T_map_camera of all frames with a pose in the map.
 
         Raises:
-            DataError: The file is damaged.
+            DataError: The file of the trajectory is damaged.
         """
         return read_only(self._source.trajectory())
 
@@ -71,7 +72,7 @@ class Run:
         """Return the objects of the map.
 
         Args:
-            text: Name or synonym; None for all objects.
+            text: Name or synonym of the objects; None for all objects.
 
         Returns:
             The objects that match, best match first; empty if there are none.
@@ -96,15 +97,17 @@ class Run:
         """Write the map or the trajectory for other programs, as `ldo export` does.
 
         Args:
-            format: Gaussians: ply, splat, spz. Trajectory: tum, csv. For planners: mesh, occupancy.
+            format: ply, splat or spz for the Gaussians; tum or csv for the trajectory; mesh or
+                occupancy for planners.
             out: File to write.
-            voxel_m: Side of a voxel of mesh and occupancy, meters; None for the default.
-            up: Axis of the map that points up, for the floor plan of occupancy.
-            heights_m: Height range of the floor plan in meters above the first camera.
-            overwrite: True replaces an earlier file.
+            voxel_m: Side of a voxel, meters, for mesh and occupancy; None for the default.
+            up: Axis of the map that points up, for the floor plan that occupancy also writes.
+            heights_m: Lowest and highest height of the voxels in this floor plan, meters above the
+                first camera.
+            overwrite: True replaces an existing file.
 
         Returns:
-            The file.
+            Path of the written file.
 
         Raises:
             ConfigError: The file exists, is an output of the run, or cannot be written.

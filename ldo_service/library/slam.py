@@ -8,8 +8,8 @@
         slam.finish()
         slam.save("runs/desk")
 
-The actors are those of `ldo run`, on the same logical clock. Equal frames and settings therefore
-give the same poses and the same map, bit for bit.
+`Slam` runs the same actors as `ldo run`, on a logical clock that ticks once per frame. Equal frames
+and settings therefore give the same poses and the same map, bit for bit.
 """
 
 from collections import deque
@@ -54,7 +54,7 @@ class Slam:
 
     Attributes:
         camera: Camera of the frames.
-        depth_scale: Units of the depth images per meter.
+        depth_scale: Number of depth units per meter.
         config: Configuration in use.
     """
 
@@ -124,8 +124,8 @@ class Slam:
     ) -> Pose:
         """Track a frame, and map it if it becomes a keyframe.
 
-        The arrays may be of NumPy, of another library with DLPack such as torch on the CPU, or
-        buffers. They are copied, so the caller may reuse them.
+        Images may be NumPy arrays, arrays of another library with DLPack such as torch on the CPU,
+        or buffers. They are copied, so the caller may reuse them.
 
         Args:
             color: RGB image, [H, W, 3] uint8.
@@ -133,8 +133,8 @@ class Slam:
                 unit is 1/depth_scale meters; it is 0, NaN or infinity where not measured.
             stamp_ns: Time of the exposure in ns, later than that of the last frame.
             prior: T_odom_camera [4, 4] of another odometry at the time of the exposure, such as
-                that of a phone; None if unknown. Only the motion between two priors is used: as an
-                initial guess, and in place of tracking while that is lost.
+                that of a phone; None if unknown. Only the motion between two priors is used. It
+                gives an initial guess, and replaces tracking while tracking is lost.
 
         Returns:
             The pose of the frame.
@@ -142,7 +142,7 @@ class Slam:
         Raises:
             FrameError: An argument has a wrong type, shape or stamp. The frame is skipped, and
                 tracking continues with the next one.
-            StageError: An actor failed, now or before. The results so far stay available.
+            StageError: An actor failed in this or an earlier call. The results so far stay usable.
             ConfigError: `finish` or `close` was called before.
         """
         self._require_usable("track")
@@ -163,8 +163,8 @@ class Slam:
         pose = self._last_pose
         if pose is None or pose.frame != number:
             raise FrameError(
-                f"frame {number} was rejected. The log of ldo_service has the reason; "
-                "logging.basicConfig() shows it."
+                f"frame {number} was rejected. The log of ldo_service has the reason. Call "
+                "logging.basicConfig() before `track` to show the log."
             )
         return pose_of(pose)
 
@@ -172,19 +172,19 @@ class Slam:
         """Wait for the mapping of all frames, close the last loops, and refit the moved keyframes.
 
         If Ctrl-C interrupts the call, another call continues the work. Each further call with
-        iterations refines the map further.
+        `refine_iterations` above 0 refines the map further.
 
         Args:
-            refine_iterations: Iterations that optimize the whole map further.
+            refine_iterations: Number of additional iterations that optimize the whole map.
 
         Raises:
-            ConfigError: `close` was called before, or the number is negative.
-            StageError: An actor failed, now or before. The results so far stay available.
+            ConfigError: `close` was called before, or `refine_iterations` is negative.
+            StageError: An actor failed in this or an earlier call. The results so far stay usable.
         """
         self._require_usable("finish")
         if not isinstance(refine_iterations, int) or refine_iterations < 0:
             raise ConfigError(
-                f"refine_iterations={refine_iterations!r} must be a number of at least 0."
+                f"refine_iterations={refine_iterations!r} must be an integer of at least 0."
             )
         if not self._is_ending:
             self._is_ending = True
@@ -224,7 +224,7 @@ class Slam:
         """Return the objects of the map. Without a detector (`detector.model`), there are none.
 
         Args:
-            text: Name or synonym; None for all objects.
+            text: Name or synonym of the objects; None for all objects.
 
         Returns:
             The objects that match, best match first; empty if there are none.
@@ -234,12 +234,12 @@ class Slam:
     def save(self, folder: FilePath, *, overwrite: bool = False) -> Path:
         """Write the folder of a run, as `ldo run` does; see docs/run-folder.md.
 
-        The folder contains the map after all iterations of `finish`. Times and frame rate in
-        summary.json count only the steps of this object.
+        The folder contains the map after all iterations of `finish`. The times and the frame rate
+        in summary.json cover only the work of this object, not the time between its calls.
 
         Args:
             folder: The folder; it is created.
-            overwrite: True replaces the files of an earlier run.
+            overwrite: True replaces the files of an earlier run in this folder.
 
         Returns:
             The folder. `Run.open` reads it, and so do `ldo eval`, `ldo view` and `ldo export`.
@@ -260,8 +260,8 @@ class Slam:
                 self._run.record.save(path, summary)
         except OSError as error:
             raise ConfigError(
-                f"{path} cannot be written: {error.strerror}. Free some space, or choose another "
-                "folder; the files in this one are incomplete."
+                f"{path} cannot be written: {error.strerror}. The files in this folder are "
+                "incomplete. Free some space, or choose another folder."
             ) from error
         return path
 
@@ -272,7 +272,7 @@ class Slam:
         images = array_of("color", color), array_of("depth", depth)
         if images[1].dtype == np.uint16 and self.depth_scale == 1.0:
             raise FrameError(
-                "depth is uint16, but depth_scale is 1, so a unit would be a meter. Create "
+                "depth is uint16, but depth_scale=1 means that one unit is a meter. Create "
                 "Slam(camera, depth_scale=1000) for millimeters, or give meters as float32."
             )
         try:
@@ -364,6 +364,6 @@ def _configured(config: Config | FilePath | None, settings: Mapping[str, object]
     if config is not None and not isinstance(config, (str, PathLike)):
         raise ConfigError(
             f"config is a {type(config).__name__}, must be a Config or the path of a YAML file. "
-            "Single settings are given as settings={...}."
+            "Give single settings as settings={...}."
         )
     return load_config(None if config is None else Path(config).expanduser(), values=settings)

@@ -1,7 +1,7 @@
 """Checks of loop hypotheses against the map: plausible drift and perceptual aliasing.
 
-Rooms with the same furniture look alike in images. The keyframe poses in the map distinguish them,
-because drift along the camera path is bounded.
+Rooms with the same furniture look alike in images. The keyframe poses in the map distinguish such
+rooms, because drift along the camera path is bounded.
 Conventions: `ldo_service.geometry`.
 """
 
@@ -21,7 +21,7 @@ from .verification import LoopHypothesis
 
 @dataclass(frozen=True, slots=True)
 class ConsistencyCheckConfig:
-    """Limits of the drift that a loop hypothesis implies, and of its ambiguity."""
+    """Limits of the drift and of the ambiguity of a loop hypothesis."""
 
     drift_m: float = 0.5  # Allowed position drift on any path.
     # Additional position drift in meters per meter of path; ten times that of depth cameras.
@@ -46,15 +46,15 @@ class ConsistencyCheckConfig:
         ):
             raise ConfigError(
                 named(self, *self.__slots__)
-                + " must be at least 0, and ambiguous_inlier_ratio at most 1."
+                + ": each value must be at least 0, and ambiguous_inlier_ratio must be at most 1."
             )
 
 
 class ConsistencyChecker:
     """Check of loop hypotheses against the known keyframe poses.
 
-    Hypotheses between submaps that are not merged are not checked, because the relative pose of the
-    submaps is unknown.
+    A hypothesis between two submaps is not checked if they are not merged, because their relative
+    pose is unknown.
     """
 
     def __init__(
@@ -74,10 +74,10 @@ class ConsistencyChecker:
     ) -> np.ndarray:
         """Return which of S stored keyframes may show the same surfaces as a new one, [S] bool.
 
-        A keyframe is excluded if its distance or its rotation from the new one is too large. The
-        limit is the maximum drift plus the largest pose difference of two cameras that see the same
-        surfaces (`view_depths`, `view_rad`). A keyframe without a known relative pose is not
-        excluded.
+        A stored keyframe is excluded if its distance or its rotation from the new keyframe is too
+        large. Each limit is the maximum drift plus the largest pose difference of two cameras that
+        see the same surfaces (settings `view_depths` and `view_rad`). A stored keyframe is not
+        excluded if its pose relative to the new keyframe is unknown.
         """
         if new.keyframe not in self._poses:
             return np.ones(len(old), bool)
@@ -104,18 +104,18 @@ class ConsistencyChecker:
         is_possible: np.ndarray,
         min_gap_frames: int,
     ) -> np.ndarray:
-        """Return how far each of S stored subgraphs is from a new one in the map, [S] rad.
+        """Return the rotation plus parallax from each of S stored subgraphs to a new one, [S] rad.
 
-        This is the smallest rotation plus parallax between a stored keyframe of the one and a
-        keyframe of the other that can be closed: both are more than `min_gap_frames` apart.
-        Otherwise, the subgraph before the new one would always be the nearest. The result is
-        infinite for subgraphs that are not possible, and for those without a known relative pose.
+        The value is the minimum over the pairs of a keyframe of the stored subgraph and a keyframe
+        of the new one. Pairs that are at most `min_gap_frames` frames apart are left out.
+        Otherwise, the subgraph before the new one would always be the nearest. The value is
+        infinite if a subgraph is not compared, or if its pose relative to the new one is unknown.
 
         Args:
             old: Stored subgraphs.
             new: New subgraph.
-            is_possible: Which subgraphs to compare, [S] bool.
-            min_gap_frames: The keyframes of a closure are more than this number of frames apart.
+            is_possible: True for the stored subgraphs to compare, [S] bool.
+            min_gap_frames: Keyframes of a pair are more than this number of camera frames apart.
         """
         motions_rad = np.full(len(old), np.inf)
         at = [k for k in np.flatnonzero(is_possible).tolist() for _ in old[k].views]
@@ -160,8 +160,9 @@ class ConsistencyChecker:
     def reject_aliased(self, proposals: Sequence[LoopHypothesis]) -> list[LoopHypothesis]:
         """Return all hypotheses of a new subgraph; the ambiguous ones are marked as rejected.
 
-        A hypothesis is ambiguous if another one has enough inliers (`ambiguous_inlier_ratio`) and
-        gives the new keyframe a pose that differs by more than `ambiguous_rad`.
+        Hypothesis A is ambiguous if a hypothesis B fits nearly as well and gives the new keyframe
+        another pose. B must have at least the fraction `ambiguous_inlier_ratio` of the inliers of
+        A. The rotation plus parallax between the poses must exceed `ambiguous_rad`.
         """
         return [
             replace(proposal, rejected_reason="ambiguous: another place fits as well")

@@ -1,4 +1,4 @@
-"""Pairs of an old and a new keyframe of two subgraphs, in the order in which they are compared.
+"""Pairs of a keyframe of an old and a keyframe of a new subgraph, in the order of comparison.
 
 Conventions: `ldo_service.geometry`.
 """
@@ -22,8 +22,8 @@ def distant_pairs(
 ) -> list[tuple[SubgraphKeyframe, SubgraphKeyframe]]:
     """Return all pairs (old, new) that are more than `min_gap_frames` camera frames apart.
 
-    The frame number of the old keyframe may be the larger one, because frame numbers restart at 0
-    when the camera restarts.
+    Frame numbers restart at 0 when the camera restarts, so the old keyframe may have the larger
+    frame number.
     """
     return [
         (a, b) for a, b in product(old.views, new.views) if abs(b.frame - a.frame) > min_gap_frames
@@ -33,7 +33,7 @@ def distant_pairs(
 def likely_pairs(
     old: Subgraph, new: Subgraph, min_gap_frames: int
 ) -> Iterator[tuple[SubgraphKeyframe, SubgraphKeyframe]]:
-    """Iterate over the distant pairs; pairs with the most visual words in common come first."""
+    """Iterate over `distant_pairs`; pairs with the most visual words in common come first."""
     pairs = distant_pairs(old, new, min_gap_frames)
     shared = [float(np.minimum(a.words, b.words).sum()) for a, b in pairs]
     return (pairs[index] for index in np.argsort(-np.array(shared), kind="stable"))

@@ -130,11 +130,12 @@ class LoopDetector:
             place: Record of the keyframe, without pixels of dynamic classes.
             frame: Frame number of the camera.
             stamp_ns: Stamp of the keyframe.
-            sightings: Detections as points; None if no detector ran.
+            sightings: Detections as labelled 3D points; None if no detector ran.
             poses: T_map_keyframe of the stored keyframes. Loops of keyframes without a pose are not
                 checked for plausible drift.
             merged: For each merged submap, the older submap that it is merged into.
-            objects: Objects of the map, which the stage two_stage uses; None if there is no map.
+            objects: Objects of the map, used if the setting `stages` is two_stage; None if there is
+                no map.
         """
         results: list[LoopCandidateResult] = []
         if self._open and not follows(self._open[-1].place, place, self._config.subgraphs):
@@ -154,8 +155,8 @@ class LoopDetector:
         """Complete the unfinished subgraph if it is long enough, and return its loop candidates.
 
         Call this when no further keyframe follows: at the end of a run and after a loss of
-        tracking. Loops are likely then. A run often ends where it began. After a loss, the newest
-        keyframes are near the place where tracking was lost.
+        tracking. Loops are likely at these times. A run often ends where it began. After a loss,
+        the newest keyframes are near the place where tracking was lost.
         """
         if not self.can_flush:
             return []
@@ -311,8 +312,7 @@ class LoopDetector:
     def snapshot(self) -> dict[str, Any]:
         """Return the state for a checkpoint.
 
-        The entries of the lists `subgraphs` and `views` are never modified later. The other values
-        are small.
+        The entries of the lists `subgraphs` and `views` are never modified later.
         """
         return {
             "subgraphs": [subgraph.pack() for subgraph in self._memory.subgraphs],

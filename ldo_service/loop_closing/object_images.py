@@ -1,7 +1,8 @@
 """Comparison of the images of an object in two keyframes.
 
-A clock on a wall is as deep as the wall, so that depth cannot show that it is missing. Its image
-can. The comparison needs the relative pose of the keyframes. Conventions: `ldo_service.geometry`.
+A clock on a wall has the same depth as the wall, so only the image can show that the clock is
+missing. The comparison needs the relative pose of the keyframes. Conventions:
+`ldo_service.geometry`.
 """
 
 from dataclasses import dataclass
@@ -30,7 +31,7 @@ SMOOTH_PX = 3  # Width of the smoothed block of pixels: poses have an error of a
 def depth_sigma_m(depth_m: np.ndarray) -> np.ndarray:
     """Return the standard deviation of the depth of a structured-light camera, meters.
 
-    The model is the axial part of that of Nguyen, Izadi and Lovell (3DIMPVT 2012).
+    The formula is the axial noise model of Nguyen, Izadi and Lovell (3DIMPVT 2012).
     """
     return 0.0012 + 0.0019 * (depth_m - 0.4) ** 2
 
@@ -42,7 +43,7 @@ class PosedImage:
     Attributes:
         gray: Smoothed gray image, [H, W] float32; NaN near ignored pixels.
         depth_m: Depth, [H, W], meters; 0 where unknown.
-        camera: Intrinsics of both.
+        camera: Intrinsics of the image and of the depth.
         T_map_camera: Pose, [4, 4].
     """
 
@@ -53,10 +54,10 @@ class PosedImage:
 
 
 def smoothed(gray: np.ndarray) -> np.ndarray:
-    """Return a gray image [H, W] as the mean of blocks of `SMOOTH_PX` pixels, float32.
+    """Smooth a gray image [H, W]: each pixel becomes the mean of the block around it, float32.
 
-    The mean is NaN if the block contains an ignored pixel, whose gray level is 0. Overexposed
-    pixels are ignored.
+    A block is `SMOOTH_PX` pixels wide and high. The mean is NaN if the block contains an ignored
+    pixel. Ignored pixels, such as overexposed ones, have the gray level 0.
     """
     block = np.ones((SMOOTH_PX, SMOOTH_PX), np.uint8)
     means = cv2.blur(gray.astype(np.float32), block.shape)
@@ -76,20 +77,20 @@ def compare_images(
 ) -> ImageComparison | None:
     """Compare the images of an object in two keyframes.
 
-    The pixels are a grid on the object in the first image. The depth of each gives a point of its
-    surface, which the pose brings to the second image. Points that are not at the depth of the
-    second image are hidden there and left out. The correlation is normalized: exposure and
+    The compared pixels form a grid on the object in the first image. The depth of each pixel gives
+    a surface point, which the keyframe poses transform to the second image. A point is left out if
+    its depth there differs from the measured depth. The correlation is normalized, so exposure and
     brightness do not change it.
 
     Args:
         p_map: Centroid of the object, [3], meters.
-        covariance: Covariance of the positions of its Gaussians, [3, 3], m^2.
+        covariance: Covariance of the positions of the object's Gaussians, [3, 3], m^2.
         first: Keyframe that shows the object.
         second: Keyframe to compare.
 
     Returns:
-        The comparison; None if either image has fewer than `MIN_PIXELS` pixels in common with the
-        other one. An object that is far away in one of them has too few.
+        The comparison. None if fewer than `MIN_PIXELS` pixels of either image can be compared, for
+        example because the object is far away from one camera.
     """
     u, v, p = _surface(p_map, covariance, first)
     if len(u) < MIN_PIXELS:

@@ -23,7 +23,7 @@ HIDDEN_NAMES = OTHER + 1
 
 @dataclass(frozen=True, slots=True)
 class LandmarkConfig:
-    """Parameters of the landmarks of a subgraph: objects, each found from several detections."""
+    """Parameters of landmarks: objects of a subgraph, each merged from several detections."""
 
     foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
     # Detections with the same label belong to one object if their distance is below this limit.
@@ -87,12 +87,12 @@ def locate_detections(
     camera: Camera,
     config: LandmarkConfig,
 ) -> DetectionPoints:
-    """Locate detections in 3D: each becomes the median point of the foreground of its box.
+    """Locate detections in 3D: each point is the median of the foreground pixels in the box.
 
     Args:
         labels: Label indices, [K].
         scores: Scores 0..1, [K].
-        boxes: x0, y0, x1, y1 in pixels of the depth image, [K, 4].
+        boxes: Corners x0, y0, x1, y1 in pixels of the depth image, [K, 4].
         depth_m: Depth, [H, W], meters; 0 where unknown.
         camera: Intrinsics of the depth image.
         config: Parameters of the landmarks.
@@ -115,9 +115,9 @@ class SubgraphLandmarks:
     """Landmarks of a subgraph.
 
     Attributes:
-        p_odom: Points in the odometry frame of the submap, [K, 3], meters.
-        labels: Labels of the sparse distributions, [K, 8] uint8.
-        weights: Weights of these labels, [K, 8] float32.
+        p_odom: Positions of the landmarks in the odometry frame of the submap, [K, 3], meters.
+        labels: The eight likeliest labels of each landmark, [K, 8] uint8.
+        weights: Probabilities of these labels, [K, 8] float32.
     """
 
     p_odom: np.ndarray
@@ -139,7 +139,7 @@ class SubgraphLandmarks:
         return self.labels[np.arange(len(self)), best].astype(np.int64)
 
     def pack(self) -> dict[str, Any]:
-        """Return the arrays by name."""
+        """Return a dictionary of the arrays by attribute name."""
         return {"p_odom": self.p_odom, "labels": self.labels, "weights": self.weights}
 
 
@@ -148,13 +148,12 @@ def cluster_landmarks(
 ) -> SubgraphLandmarks:
     """Merge the detections of a subgraph's keyframes into landmarks, one per object.
 
-    The label distribution of a landmark is the mean over its detections. A detection puts its score
-    on its label and the remaining probability on `other`. The position of a landmark is the mean of
-    its detections.
+    The position and the label distribution of a landmark are means over its detections. In the
+    distribution of a detection, its label has its score as probability, and `other` has the rest.
 
     Args:
         seen: Detections of each keyframe.
-        T_odom_camera: Pose of each keyframe in the odometry frame, [4, 4].
+        T_odom_camera: Pose [4, 4] of each keyframe in the odometry frame of the submap.
         config: Parameters of the landmarks.
     """
     places: list[np.ndarray] = []  # Sums of the points.
@@ -202,10 +201,10 @@ def _same(
 
 
 def layout_histogram(landmarks: SubgraphLandmarks) -> np.ndarray:
-    """Return a histogram of pairs of labels and their distances, [512] float32.
+    """Return a histogram of landmark pairs by their two labels and their distance, [512] float32.
 
-    Unlike a histogram of labels, it distinguishes a row of chairs from chairs around a table. It
-    contains distances but no directions, so it does not depend on the viewpoint.
+    Unlike a histogram of labels, this one distinguishes a row of chairs from chairs around a table.
+    It contains distances but no directions, so it does not depend on the viewpoint.
     """
     out = np.zeros(LAYOUT_WORDS, np.float32)
     first, second = np.triu_indices(len(landmarks), 1)
@@ -239,8 +238,8 @@ def possible_pairs(
 ) -> np.ndarray:
     """Return the index pairs (old, new) of landmarks with similar label distributions, [M, 2].
 
-    The KL divergence must be below `config.max_divergence` in both directions. The default, 0.3
-    nats, comes from the LDO-SLAM paper, III.C.
+    Label distributions are similar if their KL divergence is below `config.max_divergence` in both
+    directions. The default, 0.3 nats, comes from section III.C of the LDO-SLAM paper.
     """
     return np.argwhere(_divergences(old, new) < config.max_divergence)
 
@@ -254,7 +253,8 @@ def compare_landmarks(
         old: Landmarks of the old subgraph.
         new: Landmarks of the new subgraph.
         pairs: Index pairs (old, new) of the matched landmarks, [M, 2].
-        contradicted: Number of contradicting landmarks, which is stored in the result.
+        contradicted: Number of new landmarks that contradict the relative pose; stored in the
+            result.
     """
     if not len(pairs):
         return LandmarkAgreement(0, contradicted, 0.0, 0.0)
@@ -272,7 +272,8 @@ def compare_landmarks_at(
     Args:
         old: Landmarks of the old subgraph.
         new: Landmarks of the new subgraph.
-        T_old_new: Transform from the new odometry frame to the old one, [4, 4].
+        T_old_new: Transform from the odometry frame of `new` to the odometry frame of `old`,
+            [4, 4].
         config: Parameters of the landmarks.
     """
     if not len(old) or not len(new):

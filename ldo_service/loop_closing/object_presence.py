@@ -1,11 +1,11 @@
-"""Check of a relative pose by the objects of the map: objects that the other place does not have.
+"""Check of the relative pose of two subgraphs: both must show the same objects of the map.
 
-Places with the same furniture look alike to features and to surfaces, but differ in some objects.
-If the relative pose of two subgraphs is right, an object that one subgraph shows is also in the
-views of the other one, unless it was moved. A measured surface behind the place of an object shows
-that the object is missing, and so does an image without its pattern; this needs no detection. Two
-objects at one place that have different labels show that one replaces the other. Conventions:
-`ldo_service.geometry`.
+Places with the same furniture have similar features and surfaces, but differ in some objects. If
+the relative pose of two subgraphs is right, an object that one subgraph shows is also visible in
+the other one, unless the object was moved. The object is missing if the other subgraph measures a
+surface behind it, or if the images there do not show its pattern. These two tests need no
+detections. If the subgraphs have objects with different labels at one place, the object was
+replaced. Conventions: `ldo_service.geometry`.
 """
 
 from collections.abc import Callable, Sequence
@@ -72,7 +72,7 @@ class MapLandmarks:
     Attributes:
         p_map: Centroids in the map frame, [K, 3], meters.
         covariance: Covariances of the positions of the objects' Gaussians, [K, 3, 3], m^2.
-        distributions: Label distributions over any C labels, [K, C].
+        distributions: Label distributions over C labels, [K, C].
     """
 
     p_map: np.ndarray
@@ -92,13 +92,13 @@ class MapLandmarks:
         return MapLandmarks(self.p_map[which], self.covariance[which], self.distributions[which])
 
     def moved(self, T: np.ndarray) -> "MapLandmarks":
-        """Return the landmarks in another frame; T [4, 4] transforms from the map to it."""
+        """Return the landmarks transformed by T [4, 4] from the map frame to another frame."""
         R = T[:3, :3]
         p = se3.transform(T, self.p_map)
         return MapLandmarks(p, R @ self.covariance @ R.T, self.distributions)
 
     def pack(self) -> dict[str, np.ndarray]:
-        """Return the arrays by name; repeated calls return the same object."""
+        """Return a dictionary of the arrays by name; repeated calls return the same dictionary."""
         return self._packed
 
     @cached_property
@@ -113,7 +113,7 @@ class MapLandmarks:
 
 @dataclass(frozen=True, slots=True)
 class ObjectPresence:
-    """Result of the check of a relative pose by objects."""
+    """Result of checking a relative pose of two subgraphs by the objects that they show."""
 
     tested: int  # Number of tests; an object that both subgraphs show counts twice.
     missing: int  # Number of tests in which the object is missing.
@@ -121,7 +121,7 @@ class ObjectPresence:
 
     @property
     def contradicts(self) -> bool:
-        """True if more objects are missing or replaced than at the same place."""
+        """True if missing plus replaced exceeds the fraction `MAX_MISSING_RATIO` of the tests."""
         return self.missing + self.replaced > MAX_MISSING_RATIO * self.tested
 
 
@@ -139,20 +139,24 @@ BALL = _unit_ball()
 def ray_fractions(
     objects: MapLandmarks, depth_m: np.ndarray, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the fractions of the rays that hit objects and that pass through them, [K] each.
+    """Return the fraction of rays that hit each object, and the fraction that pass through it.
 
-    An object is an ellipsoid with a radius of `RADIUS` standard deviations. Its rays go to points
-    within one standard deviation of the centroid. A ray enters the ellipsoid at the depth z0 and
-    leaves it at z1. The measured depth z of its pixel decides:
+    An object is an ellipsoid with a radius of `RADIUS` standard deviations. Rays go from the camera
+    to points within one standard deviation of the centroid. A ray enters the ellipsoid at the depth
+    z0 and leaves it at the depth z1. At the pixel of the ray, z is the measured depth, and `gate`
+    is the tolerance for depth noise and pose errors:
 
         z < z0 - gate                  a surface in front of the object: no information
         z0 - gate <= z <= z1 + gate    the ray hits the object
         z > z1 + gate                  the ray passes through the object
 
     Args:
-        objects: Objects in camera coordinates.
+        objects: K objects in camera coordinates.
         depth_m: Depth image, [H, W], meters; 0 where unknown.
         camera: Intrinsics of the depth image.
+
+    Returns:
+        Fractions of the rays that hit, [K], and that pass through, [K].
     """
     spread = np.linalg.cholesky(objects.covariance + MIN_SIGMA_M**2 * np.eye(3))
     points = objects.p_map[:, None] + BALL @ np.swapaxes(spread, 1, 2)
@@ -175,7 +179,7 @@ def ray_fractions(
 
 
 class ObjectPresenceChecker:
-    """Check of relative poses of subgraphs; recently used images are cached."""
+    """Check of the relative pose of two subgraphs by objects, with a cache of recent images."""
 
     def __init__(self) -> None:
         self._depth_m = lru_cache(CACHED_IMAGES)(lambda view: view.place.depth_m)
@@ -189,16 +193,16 @@ class ObjectPresenceChecker:
         T_there_new: np.ndarray,
         poses: KeyframePoses,
     ) -> ObjectPresence:
-        """Look for the objects of each of two subgraphs in the views of the other one.
+        """Look for the objects that each of two subgraphs shows in the views of the other one.
 
-        An object that is badly placed in the map, for example before a correction, is not at its
-        place in its own subgraph either. Such an object is not tested.
+        Objects may have a wrong position in the map, for example before a correction. Such an
+        object is not visible in its own subgraph at this position, and is therefore not tested.
 
         Args:
             objects: Objects in the map frame.
             old: Old subgraph.
             new: New subgraph.
-            T_there_new: Motion [4, 4] in the map frame by which a loop hypothesis moves the new
+            T_there_new: Transform [4, 4] in the map frame by which a loop hypothesis moves the new
                 subgraph.
             poses: Poses of keyframes in the map; views without a pose are ignored.
         """
@@ -289,7 +293,7 @@ def _looks_different(
 
 
 def count_replaced(a: MapLandmarks, b: MapLandmarks) -> int:
-    """Return the number of pairs of objects at one place whose labels differ.
+    """Count the pairs of objects that are at the same place but have different labels.
 
     Args:
         a: Objects of one subgraph.

@@ -1,7 +1,7 @@
 """Place database: stored subgraphs, and the search for those that resemble a new one.
 
-Histograms are compared by TF-IDF. The weight of a word comes from the number of stored subgraphs
-that contain it.
+Histograms are compared by TF-IDF: the weight of a word depends on the number of stored subgraphs
+that contain the word.
 """
 
 from dataclasses import dataclass
@@ -110,21 +110,22 @@ class RetrievalConfig:
         if self.exclude_frames < 0 or self.candidates < 1 or self.count < 3:
             raise ConfigError(
                 named(self, "exclude_frames", "candidates", "count")
-                + ": exclude_frames must not be negative, candidates must be at least 1 and count "
-                "at least 3."
+                + ": exclude_frames must be at least 0, candidates at least 1, and count at least "
+                "3."
             )
         if not (
             0 <= self.min_similarity <= 1 and min(self.min_appearance, self.max_motion_rad) >= 0
         ):
             raise ConfigError(
                 named(self, "min_similarity", "min_appearance", "max_motion_rad")
-                + ": min_similarity must be within 0..1, the others must not be negative."
+                + ": min_similarity must be within 0..1, and min_appearance and max_motion_rad "
+                "must be at least 0."
             )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RetrievalMatch:
-    """Stored subgraph that is similar to a new one; all values are 0..1, 1 for equal subgraphs."""
+    """Stored subgraph that is similar to a new one or near it; cosines and score are 0..1."""
 
     subgraph: Subgraph
     similarity: float  # Cosine of the label histograms.
@@ -140,9 +141,9 @@ class RetrievalMatch:
 class PlaceDatabase:
     """Stored subgraphs in the order of insertion, with tables of the histograms of the subgraphs.
 
-    If there are more than `count` subgraphs, one is removed: the subgraph whose previous and next
-    subgraph along the camera path are nearest to each other. In a long run, each part of the path
-    thus keeps some subgraphs.
+    The setting `count` limits the number of subgraphs. If there are more, one subgraph is removed:
+    the one whose previous and next subgraphs along the camera path are nearest to each other. In a
+    long run, each part of the path thus keeps some subgraphs.
     """
 
     def __init__(self, words: int, stages: Stages, config: RetrievalConfig) -> None:
@@ -165,7 +166,7 @@ class PlaceDatabase:
     def add(self, subgraph: Subgraph) -> None:
         """Store a subgraph; if there are now more than the setting `count`, remove one.
 
-        The class describes which one is removed.
+        The docstring of the class describes which subgraph is removed.
         """
         self.subgraphs.append(subgraph)
         self._names.add(subgraph.names)
@@ -186,12 +187,12 @@ class PlaceDatabase:
     ) -> list[RetrievalMatch]:
         """Return the stored subgraphs that may show the same place, the likeliest first.
 
-        The setting `candidates` limits the number of similar subgraphs. One more may follow, which
-        is the nearest of the others in the map (see the setting `max_motion_rad`).
+        The most similar subgraphs come first; the setting `candidates` limits their number. The
+        nearest other subgraph in the map follows if it is within the setting `max_motion_rad`.
 
         Args:
             new: Subgraph to search for.
-            is_possible: For each of the S stored subgraphs, whether to consider it, [S] bool.
+            is_possible: True for those of the S stored subgraphs to consider, [S] bool.
             motion_rad: Rotation plus parallax in the map between each stored subgraph and `new`,
                 [S]; infinite where unknown. None if no pose is known.
         """

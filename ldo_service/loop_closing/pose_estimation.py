@@ -18,11 +18,11 @@ SPREAD = 0.1
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RansacResult:
-    """Result of RANSAC.
+    """Rigid transform that RANSAC estimated, and its inliers.
 
     Attributes:
         T_a_b: Estimated transform from frame b to frame a, [4, 4].
-        inliers: For each correspondence, whether it agrees with the transform, [M] bool.
+        inliers: True for correspondences that agree with the transform, [M] bool.
     """
 
     T_a_b: np.ndarray
@@ -121,10 +121,12 @@ class DepthConsistencyConfig:
         if min(self.gate_m, self.max_rmse_m) <= 0 or self.gate_share < 0:
             raise ConfigError(
                 named(self, "gate_m", "gate_share", "max_rmse_m")
-                + ": gate_m and max_rmse_m must be positive, gate_share must not be negative."
+                + ": gate_m and max_rmse_m must be positive, and gate_share at least 0."
             )
         if not (0 <= self.min_overlap <= 1 and 0 <= self.max_conflict <= 1):
-            raise ConfigError(named(self, "min_overlap", "max_conflict") + " must be within 0..1.")
+            raise ConfigError(
+                named(self, "min_overlap", "max_conflict") + ": both must be within 0..1."
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,7 +158,8 @@ def check_depth_consistency(
     Here gate = gate_m + gate_share z_q.
 
     Args:
-        points: Points of the new keyframe (see `Reference`), [7, N].
+        points: Points of the new keyframe, [7, N]; `tracking.pyramid.ReferencePoints` describes the
+            rows.
         T_old_new: Pose of the new keyframe in the old one, [4, 4].
         old_depth_m: Depth of the old keyframe, [H, W], meters; 0 where unknown.
         camera: Intrinsics of the old keyframe.

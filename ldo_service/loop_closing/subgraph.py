@@ -56,11 +56,11 @@ class SubgraphKeyframe:
 
     Attributes:
         place: Record of the keyframe.
-        frame: Frame number of the camera.
-        stamp_ns: Stamp of the keyframe.
+        frame: Number of the camera frame.
+        stamp_ns: Time of the keyframe, ns.
         path_m: Length of the camera path up to this keyframe, meters.
         has_detections: True if a detector ran on the keyframe, even if it found nothing.
-        sightings: Detections as points.
+        sightings: Detections as labelled 3D points.
         words: Counts of visual words, [W] float32.
     """
 
@@ -78,7 +78,10 @@ class SubgraphKeyframe:
         return self.place.id
 
     def pack(self) -> dict[str, Any]:
-        """Return the fields as arrays and plain values; repeated calls return the same object."""
+        """Return a dictionary of the fields; repeated calls return the same dictionary.
+
+        The values are arrays and plain values.
+        """
         return self._packed
 
     @cached_property
@@ -103,14 +106,14 @@ class Subgraph:
     Attributes:
         views: Stored keyframes, the oldest first.
         keyframes: Ids of all keyframes.
-        first_frame: Smallest frame number.
-        last_frame: Largest frame number.
-        stamp_ns: Stamp of the newest keyframe.
+        first_frame: Smallest camera frame number of the keyframes.
+        last_frame: Largest camera frame number of the keyframes.
+        stamp_ns: Time of the newest keyframe, ns.
         path_m: Length of the camera path up to the newest keyframe, meters.
         has_detections: True if a detector ran on one of the keyframes.
         landmarks: Landmarks in the odometry frame of the submap.
         names: Histogram of labels, weighted by the detection scores, [256] float32.
-        layout: Histogram of pairs of labels and distances, [512] float32.
+        layout: Histogram of landmark pairs by labels and distance, [512] float32.
         words: Histogram of visual words, [W] float32.
     """
 
@@ -132,7 +135,10 @@ class Subgraph:
         return self.views[0].place.submap
 
     def pack(self) -> dict[str, Any]:
-        """Return the fields as arrays and plain values; repeated calls return the same object."""
+        """Return a dictionary of the fields; repeated calls return the same dictionary.
+
+        The values are arrays and plain values.
+        """
         return self._packed
 
     @cached_property
@@ -155,8 +161,9 @@ class Subgraph:
 def follows(before: KeyframeRecord, place: KeyframeRecord, config: SubgraphConfig) -> bool:
     """Return whether a keyframe belongs to the same subgraph as the previous keyframe.
 
-    This is the case if both keyframes are in the same submap and at most `gap_rad` apart. Two
-    consecutive keyframes are far apart if the tracker reused existing keyframes between them.
+    Both keyframes must be in the same submap, and the rotation plus parallax between them must not
+    exceed `gap_rad`. Consecutive keyframes are far apart if the tracker reused existing keyframes
+    between them.
 
     Args:
         before: Record of the previous keyframe.

@@ -1,10 +1,11 @@
-"""Verification of loop candidates: the pose between two keyframes of two subgraphs.
+"""Verification of loop candidates, which are pairs of similar subgraphs.
 
-A subgraph is a group of consecutive keyframes. `place_database` finds pairs of similar subgraphs,
-the candidates. A pose comes from ORB features, from landmarks or from the map. Landmarks or a
-second keyframe of the new subgraph must confirm the pose, and the landmarks must not contradict it.
-Direct alignment then refines the pose on the images. This may change it only a little. At the
-refined pose, the surfaces must overlap without conflict. Conventions: `ldo_service.geometry`.
+A subgraph is a group of consecutive keyframes. `place_database` finds the loop candidates. For each
+candidate, a pose between an old and a new keyframe is estimated from ORB features, from landmarks
+or from the map. Landmarks or a second new keyframe must confirm this pose, and landmarks must not
+contradict it. Direct alignment then refines the pose on the images. A large change of the pose is
+rejected. At the refined pose, the surfaces must overlap without conflict. Conventions of poses:
+`ldo_service.geometry`.
 """
 
 from dataclasses import dataclass, field, replace
@@ -48,7 +49,10 @@ FIT_LEVEL = 1  # Pyramid level of 160 pixels width: 19,200 points suffice for th
 
 @dataclass(frozen=True, slots=True)
 class VerificationConfig:
-    """Parameters of the verification of loop candidates, which are pairs of subgraphs."""
+    """Parameters of the verification of loop candidates.
+
+    A loop candidate is a pair of similar subgraphs, which are groups of consecutive keyframes.
+    """
 
     landmarks: LandmarkConfig = field(default_factory=LandmarkConfig)
     fit: DepthConsistencyConfig = field(default_factory=DepthConsistencyConfig)
@@ -86,10 +90,13 @@ class VerificationConfig:
         if self.min_inliers < 6 or self.pairs < 1:
             raise ConfigError(
                 named(self, "min_inliers", "pairs")
-                + ": min_inliers must be at least 6, pairs at least 1."
+                + ": min_inliers must be at least 6, pairs must be at least 1."
             )
         if not (0 <= self.blind_overlap <= 1 and 0 <= self.map_overlap <= 1):
-            raise ConfigError(named(self, "blind_overlap", "map_overlap") + " must be within 0..1.")
+            raise ConfigError(
+                named(self, "blind_overlap", "map_overlap")
+                + ": blind_overlap and map_overlap must be within 0..1."
+            )
         angles = (self.confirmation_rad, self.refined_rad, self.refined_landmarks_rad)
         if min(*angles, self.map_confirmation_rad) <= 0 or self.map_pairs < 0:
             raise ConfigError(
@@ -101,13 +108,13 @@ class VerificationConfig:
                     "refined_rad",
                     "refined_landmarks_rad",
                 )
-                + ": angles must be positive, map_pairs must not be negative."
+                + ": the values in radians must be positive, map_pairs must not be negative."
             )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LoopHypothesis:
-    """Pose between two keyframes that is not yet verified."""
+    """Loop hypothesis: a pose between an old and a new keyframe, not yet verified."""
 
     old: SubgraphKeyframe  # Keyframe of the old subgraph.
     new: SubgraphKeyframe  # Keyframe of the new subgraph.
@@ -120,7 +127,7 @@ class LoopHypothesis:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class VerificationResult:
-    """Result of verifying a hypothesis."""
+    """Result of the verification of a loop hypothesis."""
 
     proposal: LoopHypothesis  # The hypothesis.
     overlap: float = 0.0  # Fraction of the new surface that the old keyframe also sees, 0..1.
@@ -130,7 +137,7 @@ class VerificationResult:
 
 
 class Verifier:
-    """Verifier of loop candidates.
+    """Verifier of loop candidates, which are pairs of similar subgraphs.
 
     Equal subgraphs give bitwise equal results. Recently decompressed keyframes are cached.
     """
@@ -160,9 +167,10 @@ class Verifier:
     def hypothesis_from_features(self, old: Subgraph, new: Subgraph) -> LoopHypothesis:
         """Return the pose with the most feature inliers, marked as rejected if it is not confirmed.
 
-        Pairs of keyframes are matched until a second keyframe of `new` gives the same pose as the
-        best pair so far. If none does, matching landmarks or the verification of another keyframe
-        of `new` must confirm the best pose; otherwise, the hypothesis is rejected.
+        Each pair of an old and a new keyframe gives a pose from its feature matches. A pose is
+        confirmed if a pair with another new keyframe gives nearly the same pose. The search ends
+        with the first confirmed pose. If there is none, matching landmarks or the verification of
+        another new keyframe can confirm the pose with the most inliers.
         """
         found: list[LoopHypothesis] = []
         for a, b in islice(likely_pairs(old, new, self._min_gap_frames), self._config.pairs):
@@ -222,10 +230,11 @@ class Verifier:
         )
 
     def hypothesis_from_landmarks(self, old: Subgraph, new: Subgraph) -> LoopHypothesis:
-        """Return the relative pose of the two subgraphs that most landmarks agree with.
+        """Return the relative pose of two subgraphs, estimated from their landmarks.
 
-        The pose is returned for the two keyframes that are nearest to each other at this relative
-        pose. The hypothesis is rejected if fewer than `min_inliers` landmarks agree.
+        RANSAC finds the relative pose at which the most landmarks coincide. The hypothesis contains
+        this pose for the pair of keyframes that are nearest to each other. The hypothesis is
+        rejected if fewer than `landmarks.min_inliers` landmarks coincide.
         """
         config = self._config.landmarks
         pairs = possible_pairs(old.landmarks, new.landmarks, config)
@@ -250,17 +259,16 @@ class Verifier:
     def hypothesis_from_map(
         self, old: Subgraph, new: Subgraph, T_old_new: KnownPose
     ) -> LoopHypothesis:
-        """Return a pose from the map, refined on images, if two new keyframes give the same pose.
+        """Return a pose from the map that the image alignment of two new keyframes confirms.
 
-        Up to `map_pairs` pairs of keyframes are aligned, the nearest ones first. The alignment
-        starts at their pose in the map, `T_old_new`, and gives a refined pose. Two refined poses
-        confirm each other if they are of different new keyframes and differ by less than
-        `map_confirmation_rad`. The first confirmed pose is returned, or a rejected hypothesis if
-        there is none.
+        Up to `map_pairs` pairs of an old and a new keyframe are aligned, the nearest pairs first.
+        Each alignment starts at the pose of the pair in the map, `T_old_new`, and refines it. Two
+        refined poses confirm each other if they come from different new keyframes and differ by
+        less than `map_confirmation_rad`. The first confirmed pose is returned. If there is none,
+        the returned hypothesis is rejected.
 
-        Images of a place from different viewpoints have few features in common, and this method
-        needs none. It finds loop closures between nearby keyframes before they drift apart, but
-        finds none after a large drift.
+        This method needs no features, so it also works for images from different viewpoints. After
+        a large drift, it finds no loop closure, because the poses in the map are too inaccurate.
         """
         found: list[LoopHypothesis] = []
         pairs = nearest_pairs(old, new, T_old_new, self._min_gap_frames)
@@ -294,9 +302,9 @@ class Verifier:
 
     # --- verification -----------------------------------------------------------------------------
     def verify(self, proposal: LoopHypothesis) -> VerificationResult:
-        """Refine a pose on the images, and check the surfaces at the refined pose.
+        """Refine a pose by direct alignment of the images, and check the surfaces at this pose.
 
-        `proposal.semantics`, the agreement of the landmarks before the refinement, is checked too.
+        The pose is also rejected if too many landmarks contradict it (`proposal.semantics`).
         """
         old, new = self._opened(proposal.old), self._opened(proposal.new)
         alignment = align(old.reference, new.view, se3.inverse(proposal.T_old_new), self._align)
@@ -315,8 +323,8 @@ class Verifier:
     def accept_unverified(self, proposal: LoopHypothesis) -> VerificationResult:
         """Accept the pose from landmarks as a loop closure without refinement or checks.
 
-        The LDO-SLAM paper closes loops like this, after its comparison of landmarks. The mode
-        `semantic` does the same, for comparison with the other modes.
+        The LDO-SLAM paper also accepts loop closures right after the comparison of landmarks. The
+        mode `semantic` uses this function, so that it can be compared with the other modes.
         """
         sigma_m = self._config.landmarks.reach_m / np.sqrt(proposal.inliers)
         sigmas = np.repeat([sigma_m / _depth(proposal), sigma_m], 3)

@@ -1,4 +1,4 @@
-"""Visual words: a vocabulary of ORB descriptors, each of which represents all similar ones.
+"""Visual words: a vocabulary of ORB descriptors. Each word represents all similar descriptors.
 
 The words are learned while the loop detector runs, beginning with the first image.
 """
@@ -31,15 +31,16 @@ class VisualWordsConfig:
         if min(self.count, self.learned_at_once) < 1 or not 0 <= self.apart_bits < 8 * BYTES:
             raise ConfigError(
                 named(self, "count", "apart_bits", "learned_at_once")
-                + ": count and learned_at_once must be at least 1, apart_bits must be within "
+                + ": count and learned_at_once must be at least 1, and apart_bits must be within "
                 "0..255."
             )
 
 
 class VisualWords:
-    """Vocabulary of ORB descriptors, called words; a feature counts for its nearest word.
+    """Vocabulary of ORB descriptors, called visual words.
 
-    Words never change and are never removed. The same images in the same order give the same words.
+    A histogram counts each feature for its nearest word. Words never change and are never removed.
+    The same images in the same order give the same words.
     """
 
     def __init__(self, config: VisualWordsConfig, words: np.ndarray | None = None) -> None:
@@ -48,9 +49,13 @@ class VisualWords:
         self.words = np.zeros((0, BYTES), np.uint8) if words is None else words
 
     def learn(self, descriptors: np.ndarray) -> None:
-        """Add descriptors [N, 32] as words if they differ from every word by over `apart_bits`.
+        """Add each descriptor as a new word if it differs enough from all words.
 
-        `count` and `learned_at_once` limit the number of words.
+        The Hamming distance to every word must be more than `apart_bits`. One call adds at most
+        `learned_at_once` words, and all calls together at most `count` words.
+
+        Args:
+            descriptors: ORB descriptors of an image, [N, 32] uint8.
         """
         room = min(self._config.count - len(self.words), self._config.learned_at_once)
         if room <= 0 or not len(descriptors):
@@ -65,7 +70,7 @@ class VisualWords:
             self.words = np.concatenate([self.words, descriptors[fresh]])
 
     def histogram(self, descriptors: np.ndarray) -> np.ndarray:
-        """Return how many descriptors [N, 32] are nearest to each word, [count] float32."""
+        """Count the descriptors [N, 32] by their nearest word; return [count] float32."""
         if not len(descriptors) or not len(self.words):
             return np.zeros(self._config.count, np.float32)
         nearest = [m.trainIdx for m in _matches(descriptors, self.words)]

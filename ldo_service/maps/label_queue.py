@@ -1,4 +1,4 @@
-"""Label requests that wait until the labeller can receive them."""
+"""Queue of label requests, which ask the labeller for the names of image regions."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
@@ -26,11 +26,10 @@ class WaitingRequest(NamedTuple):
 class LabelRequestQueue:
     """Queue of label requests, at most one for each region.
 
-    A request waits until the labeller can receive it. A labeller that can receive all waiting
-    requests gets the oldest request first. A slower labeller first gets the requests that show the
-    most new surface, so large objects get their labels first. The new surface is the area that the
-    view of the request shows, minus the largest area that an earlier request of the same region
-    showed.
+    A request waits until the labeller can receive it. If the labeller can receive all waiting
+    requests, the oldest request is sent first. Otherwise, the request with the most new surface is
+    sent first, so that large objects get their labels first. The new surface is the area of the
+    region in the view of the request, minus the largest area in a sent request of the same region.
     """
 
     def __init__(self) -> None:
@@ -47,13 +46,12 @@ class LabelRequestQueue:
     def add(self, request: LabelRequest, surface_m2: float) -> list[LabelRequest]:
         """Add a request, and return the requests that leave the queue without being sent.
 
-        The new request replaces a waiting one of the same region. If the queue is then too long, it
-        also drops the request that shows the least surface beyond what the sent requests of its
-        region showed.
+        The new request replaces a waiting request of the same region. If the queue is then too
+        long, the request with the least new surface is dropped (see `LabelRequestQueue`).
 
         Args:
             request: Label request of a region.
-            surface_m2: Area of the region's surface that the view of the request shows.
+            surface_m2: Area of the region's surface in the view of the request, square meters.
         """
         replaced = self._waiting.pop(request.region, None)
         self._waiting[request.region] = WaitingRequest(request, surface_m2)
@@ -84,7 +82,7 @@ class LabelRequestQueue:
         return max(0.0, one.surface_m2 - self._shown_m2.get(one.request.region, 0.0))
 
     def pack(self) -> dict[str, Sequence[object]]:
-        """Return plain values for a checkpoint."""
+        """Return the queue as plain values for a checkpoint."""
         return {
             "waiting": [(encode(one.request), one.surface_m2) for one in self._waiting.values()],
             "shown": list(self._shown_m2.items()),
@@ -92,7 +90,7 @@ class LabelRequestQueue:
 
     @staticmethod
     def unpack(packed: dict[str, Sequence[tuple]]) -> "LabelRequestQueue":
-        """Restore a queue from `pack`."""
+        """Restore a queue from the values that `pack` returned."""
         out = LabelRequestQueue()
         for body, surface_m2 in packed["waiting"]:
             request = decode(body, LabelRequest)
@@ -102,7 +100,9 @@ class LabelRequestQueue:
 
 
 class LabelRequests:
-    """Label requests of the semantics of a map, on their way to the labeller.
+    """Queued label requests of a map; each asks the labeller for the name of an image region.
+
+    A request that is sent or withdrawn is marked so in the semantics of the map.
 
     Attributes:
         queue: Requests that wait until the labeller can receive them.
@@ -119,7 +119,7 @@ class LabelRequests:
         self._semantics, self._map = semantics, map_
 
     def add(self, regions: Iterable[Region], stamp_ns: int) -> None:
-        """Queue requests for regions, and withdraw older requests that the queue drops for them."""
+        """Queue one request for each region, and withdraw the requests that the queue drops."""
         for region in regions:
             request = label_request_to_message(region, stamp_ns)
             surface_m2 = region.surface_m2(self._map.views.cameras.get(region.keyframe))

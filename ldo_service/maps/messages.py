@@ -19,7 +19,7 @@ NOTHING = GaussianBatch(
 
 
 def gaussians_message(batch: GaussianBatch) -> Gaussians:
-    """Convert a batch to a message; `labels` is empty if no Gaussian has an observed class."""
+    """Convert a batch of Gaussians to a message, without labels if no class was observed."""
     labels = batch.labels if batch.labels.any() else new_labels(0)
     return Gaussians(
         ids=Array.of(batch.ids),
@@ -33,10 +33,10 @@ NO_GAUSSIANS = gaussians_message(NOTHING)
 
 
 def batch_of(message: Gaussians) -> GaussianBatch:
-    """Convert a message to a batch.
+    """Convert a message to a batch of Gaussians.
 
-    The arrays are read-only views of the message. If `labels` of the message is empty, the batch
-    has a new array of labels, in which no class was observed.
+    The arrays of the batch are read-only views of the message. If the message has no labels, the
+    batch gets a new array of labels, in which no class was observed.
     """
     ids, labels = message.ids.numpy(), message.labels.numpy()
     labels = labels if len(labels) else new_labels(len(ids))
@@ -46,7 +46,7 @@ def batch_of(message: Gaussians) -> GaussianBatch:
 def rechunk(batches: Iterable[GaussianBatch], parts: int, size: int) -> Iterator[Gaussians]:
     """Regroup batches into exactly `parts` messages of at most `size` Gaussians.
 
-    All messages have `size` Gaussians except for the last ones, which may be smaller or empty.
+    The messages are filled in order, so the last ones may have fewer Gaussians or none.
     """
     waiting, made = NOTHING, 0
     for batch in batches:
@@ -61,10 +61,11 @@ def rechunk(batches: Iterable[GaussianBatch], parts: int, size: int) -> Iterator
 
 
 def split_changes(changes: Changes, size: int) -> Iterator[Changes]:
-    """Divide changes into parts of at most `size` changed or added Gaussians.
+    """Divide changes of the map into parts of at most `size` changed or added Gaussians.
 
-    The first part has all removed ids, which may be more than `size`. Parts with changed Gaussians
-    follow, then parts with added ones. Empty parts are omitted.
+    The first part has the ids of all removed Gaussians, which may be more than `size`. Then follow
+    parts with changed Gaussians, and at the end parts with added Gaussians. Empty parts are
+    omitted.
     """
     if len(changes.removed):
         yield Changes(changes.removed, NO_IDS, NO_IDS)

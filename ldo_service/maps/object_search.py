@@ -29,8 +29,8 @@ def find_objects(
 ) -> list[ObjectMatch]:
     """Return the objects that match a text, the best match first.
 
-    Of equally good matches, the nearest object comes first. If no object matches by its name or a
-    synonym, `encode` is used to find names of similar meaning.
+    Among equally good matches, the object nearest to the camera comes first. If no name or synonym
+    matches, `encode` is used to find objects with names of similar meaning.
 
     Args:
         text: Text query.

@@ -57,7 +57,10 @@ class PublishConfig:
             "snapshot_interval_keyframes",
         )
         if min(getattr(self, name) for name in counts) < 1:
-            raise ConfigError(named(self, *counts) + " must be at least 1.")
+            raise ConfigError(
+                named(self, *counts) + ": max_gaussians_per_message, update_interval_keyframes and "
+                "snapshot_interval_keyframes must be at least 1."
+            )
         if self.min_snapshot_growth < 0:
             raise ConfigError(named(self, "min_snapshot_growth") + " must not be negative.")
 
@@ -78,10 +81,11 @@ class MessageContext:
 
 
 class MapPublisher:
-    """Publisher of the map of a MapBuilder, as map deltas and map snapshots.
+    """Publisher of the map of a `MapBuilder`, as map deltas and map snapshots.
 
-    Each delta increases the version of the map. New Gaussians are published with each keyframe,
-    changes of published Gaussians less often, and snapshots of the whole map rarely.
+    A delta has changes of the map, and a snapshot has the whole map. Each delta increases the
+    version of the map. New Gaussians are published at each keyframe, changes of published Gaussians
+    less often, and snapshots rarely.
     """
 
     def __init__(self, map_: MapBuilder, config: PublishConfig | None = None) -> None:
@@ -105,9 +109,9 @@ class MapPublisher:
 
         Args:
             now: Context of the messages.
-            with_changed: If True, include changes of published Gaussians. Then move Gaussians above
-                the memory limit to disk (`MapBuilder.offload_excess`). If False, include only new
-                and removed Gaussians.
+            with_changed: True to include changes of published Gaussians, and afterwards to move
+                Gaussians above the memory limit to disk (`MapBuilder.offload_excess`). False to
+                include only new and removed Gaussians.
         """
         changes = self._map.changes(with_changed=with_changed)
         for part in split_changes(changes, self.config.max_gaussians_per_message):
@@ -130,8 +134,8 @@ class MapPublisher:
         Args:
             keyframe: Message of a keyframe of the map.
             now: Context of the message.
-            contributions: True to also compute the contributions, which
-                `MapBuilder.visible_contributions` needs afterwards.
+            contributions: True to also compute the contribution of each Gaussian to the image,
+                for a later call of `MapBuilder.visible_contributions`.
         """
         views, k = self._map.views, keyframe.keyframe
         rendering = self._map.render_keyframe(k, contributions=contributions)
@@ -159,7 +163,7 @@ class MapPublisher:
 
         Args:
             now: Context of the message.
-            motions: Motions of anchor keyframes; the Gaussians move with their anchor keyframe.
+            motions: Motions of anchor keyframes. Each Gaussian moves with its anchor keyframe.
             removed: Ids of the removed Gaussians, [N] int64.
             changed: Gaussians that replace published ones with the same ids.
             added: New Gaussians.
@@ -249,8 +253,8 @@ class MapPublisher:
 class ObjectPublisher:
     """Publisher of the topic map/objects.
 
-    It caches the message of each object and converts only objects that have changed. Converting a
-    thousand objects would take 50 ms.
+    The publisher caches the message of each object and converts only objects that have changed.
+    Without the cache, the conversion of a thousand objects would take 50 ms per message.
     """
 
     def __init__(self) -> None:

@@ -20,8 +20,8 @@ class RelativeMeasurements:
     """Table of the relative-pose measurements that tracking made, by pair of keyframes.
 
     All measurements of the newest `recent` keyframes are stored. For an older keyframe, only the
-    measurement relative to its reference keyframe is stored, in 100 bytes. By then, the pose-graph
-    optimizer has condensed the older keyframe and dropped its other measurements.
+    measurement relative to its reference keyframe is stored (100 bytes). The pose-graph optimizer
+    no longer uses the other measurements of an older keyframe.
     """
 
     def __init__(self, poses: KeyframePoses, recent: int) -> None:
@@ -56,7 +56,7 @@ class RelativeMeasurements:
             stamp_ns: Stamp of the message.
 
         Returns:
-            The message for the pose-graph optimizer, or None if there are no such measurements.
+            The message for the pose-graph optimizer, or None if no measurement was recomputed.
         """
         for keyframe, T_map_keyframe in moved.items():
             self._poses.place(keyframe, T_map_keyframe)
@@ -102,13 +102,12 @@ class RelativeMeasurements:
         )
 
     def acknowledged(self, refinements: int) -> KeysView[int]:
-        """Delete the refinements that a pose correction includes; return the remaining keyframes.
+        """Return the keyframes whose last refined pose a pose correction does not include yet.
+
+        The entries of all other keyframes are deleted.
 
         Args:
             refinements: Number of the last refinement message that the correction includes.
-
-        Returns:
-            The keyframes whose last refined pose the correction does not include yet.
         """
         self._unacknowledged = {
             k: number for k, number in self._unacknowledged.items() if number > refinements

@@ -17,17 +17,18 @@ SLACK = 1.25
 class MapReplica:
     """Replica of a map. Pass every message of map/delta and map/snapshot to `apply`.
 
-    An exact replica has no limit: `map` equals the map of the mapper at `version`. After a missed
-    delta, it sets `is_behind` and does not change until it has received a complete snapshot.
+    An exact replica has all Gaussians: `map` equals the map of the mapper at `version`. After a
+    missed delta, an exact replica sets `is_behind` and stays unchanged until it has received a
+    complete snapshot.
 
-    A bounded replica has at most `max_gaussians`, plus up to a quarter more for a short time. It
-    keeps the Gaussians with the largest weight, opacity times area. After a missed delta, it sets
-    `is_behind` and still applies further deltas, so it may have errors until the next snapshot. It
-    applies each part of a snapshot on arrival: the Gaussians of the part replace all Gaussians in
-    the same range of ids.
+    A bounded replica has at most `max_gaussians` Gaussians, and up to a quarter more for a short
+    time. It keeps the Gaussians with the largest weight, which is opacity times area. After a
+    missed delta, a bounded replica sets `is_behind` and still applies further deltas, so the map
+    may have errors until the next snapshot. Each part of a snapshot is applied on arrival: its
+    Gaussians replace all Gaussians in the same range of ids.
 
     Args:
-        max_gaussians: Limit of a bounded replica; None for an exact one.
+        max_gaussians: Maximum number of Gaussians of a bounded replica; None for an exact replica.
     """
 
     def __init__(self, max_gaussians: int | None = None) -> None:

@@ -44,7 +44,7 @@ class BridgeEdge:
 def check_against_bridge(
     known: FactorStore, closure: RelativePose, start: Variables, initial: Variables
 ) -> tuple[ClosureDecision, Variables]:
-    """Check a loop closure against all other measurements, also those that are bridge edges.
+    """Check a loop closure against all other measurements, including the bridge edges.
 
     A bridge edge is the loop closure that merged two components of the graph.
 
@@ -112,9 +112,9 @@ def best_bridge_removal(
 ) -> tuple[BridgeEdge, FactorStore, Variables] | None:
     """Replace one of several bridge edges by a rejected closure if more closures then agree.
 
-    A bridge edge is a loop closure that merged two components of the graph. Each edge is tried; see
-    `replace_bridge_by_consensus`. The chosen edge is the one whose replacement leaves the most
-    accepted closures.
+    A bridge edge is a loop closure that merged two components of the graph. The replacement of each
+    edge is tried by `replace_bridge_by_consensus`. The replacement with the most accepted closures
+    is chosen.
 
     Args:
         known: Store of all measurements, which is not changed.
@@ -126,7 +126,7 @@ def best_bridge_removal(
 
     Returns:
         The replaced bridge edge, then the store and the variables after the replacement. None if no
-        edge can be replaced, or if two edges leave the same maximum number of accepted closures.
+        replacement increases the number of accepted closures, or if the best two are equally good.
     """
     found = [
         (bridge, *other)

@@ -27,10 +27,11 @@ from .solver import graph_of, values_of, variables_of
 
 @dataclass(frozen=True, slots=True)
 class CondensedKeyframes:
-    """F condensed keyframes as arrays.
+    """Condensed keyframes as arrays with one row for each of the F keyframes.
 
-    The head of a condensed keyframe is the last variable before it, and the tail is the first
-    variable after it. Keyframes with the same head and tail form a group.
+    A condensed keyframe is not a variable of the pose graph. Its pose is interpolated between two
+    variables: its head, the last variable before it, and its tail, the first variable after it.
+    Keyframes with the same head and tail form a group.
 
     Attributes:
         keyframes: Ids, [F], ascending within a group.
@@ -67,9 +68,9 @@ class CondensedKeyframes:
         return CondensedKeyframes(*(getattr(self, name)[row : row + 1] for name in self.__slots__))
 
     def head_and_tail(self, row: int) -> tuple[int, int]:
-        """Return the keyframe ids of head and tail of the condensed keyframe of one row.
+        """Return the ids of the head and the tail of the condensed keyframe of one row.
 
-        They are the last variable before the keyframe and the first variable after it.
+        The head is the last variable before the keyframe, and the tail the first variable after it.
         """
         return int(self.start_variables[row]), int(self.end_variables[row])
 
@@ -105,7 +106,7 @@ class CondensedKeyframes:
 
         Args:
             variables: Ids of the V keyframes that are variables, [V], ascending.
-            T_map_variable: Their poses in the map, [V, 4, 4].
+            T_map_variable: Poses of these variables in the map, [V, 4, 4].
         """
         heads, tails = (
             np.searchsorted(variables, ids) for ids in (self.start_variables, self.end_variables)
@@ -116,12 +117,14 @@ class CondensedKeyframes:
         return keyframes[order], np.concatenate([T_map_variable, T_map])[order]
 
     def moved(self, row: int, T_head_keyframe: np.ndarray) -> "CondensedKeyframes":
-        """Return the keyframes with one of them moved relative to the variables at its two ends.
+        """Return a copy in which one keyframe has a new pose relative to its head and its tail.
+
+        The head is the variable before the keyframe, and the tail the variable after it. The pose
+        relative to the tail is computed from the pose relative to the head.
 
         Args:
             row: Row of the moved keyframe.
-            T_head_keyframe: Its new pose relative to its head, the variable before it, [4, 4]. Its
-                pose relative to its tail, the variable after it, changes accordingly.
+            T_head_keyframe: New pose of the keyframe relative to its head, [4, 4].
         """
         T_tail_head = self.T_tail[row] @ np.linalg.inv(self.T_head[row])
         T_head, T_tail = self.T_head.copy(), self.T_tail.copy()
@@ -129,10 +132,13 @@ class CondensedKeyframes:
         return replace(self, T_head=T_head, T_tail=T_tail)
 
     def without_split(self, row: int) -> "CondensedKeyframes":
-        """Return the condensed keyframes without one keyframe, which becomes a variable again.
+        """Return a copy without one condensed keyframe, which becomes a variable again.
 
-        The new variable divides its group: it is the tail of the first part and the head of the
-        second part.
+        The new variable divides its group in two: it is the last variable (tail) of the first part
+        and the first variable (head) of the second part.
+
+        Args:
+            row: Row of the keyframe that becomes a variable.
         """
         of_group = (self.start_variables == self.start_variables[row]) & (
             self.end_variables == self.end_variables[row]
@@ -156,13 +162,13 @@ class CondensedKeyframes:
         return parted.without(row)
 
     def without(self, row: int) -> "CondensedKeyframes":
-        """Return the condensed keyframes without one row."""
+        """Return a copy without the condensed keyframe of one row."""
         return CondensedKeyframes(
             *(np.delete(getattr(self, name), row, 0) for name in self.__slots__)
         )
 
     def pack(self) -> dict[str, np.ndarray]:
-        """Return the arrays by name."""
+        """Return the arrays of the condensed keyframes by name."""
         return {name: getattr(self, name) for name in self.__slots__}
 
 
@@ -175,7 +181,7 @@ def condense_between(
 ) -> CondensedKeyframes:
     """Return the keyframes between two variables as condensed keyframes.
 
-    Their `fractions` are evenly spaced: k / (n + 1) for the k-th of n keyframes.
+    The `fractions` of the keyframes are evenly spaced: k / (n + 1) for the k-th of n keyframes.
 
     Args:
         head: Id of the first variable.
@@ -197,7 +203,7 @@ def condense_between(
 
 @dataclass(frozen=True, slots=True)
 class Condensed:
-    """Condensed group of keyframes."""
+    """Group of keyframes after condensation: one measurement and the keyframes that it spans."""
 
     edge: RelativePose  # Measurement from the first keyframe of the group to the last one.
     interpolated: CondensedKeyframes  # The keyframes between these two.
@@ -212,16 +218,14 @@ def group_to_condense(
 ) -> list[int]:
     """Choose the next group to condense: the oldest chain of at least `size` + 1 keyframes.
 
-    Each keyframe of the chain but the first has an odometry measurement from an earlier one. The
-    first keyframe of a group is its head, and the last one its tail, which is also the head of the
-    next group. The head or tail of an existing group must stay a variable, so it can only be the
-    head of a new group.
+    In a chain, each keyframe after the first has an odometry measurement from an earlier keyframe
+    of the chain. The first keyframe of a group is its head, and the last one is its tail. Head and
+    tail stay variables. The head or tail of an existing group may only be the head of a new group.
 
-    The keyframe that follows the tail should be measured relative to the tail. If it is measured
-    only relative to keyframes inside the group, condensation transfers these measurements to the
-    head or the tail. In later corrections, the keyframe would follow only that variable. The group
-    is therefore extended, up to twice `size`, until the keyframe after it is measured relative to
-    its tail.
+    The group is extended, up to twice `size`, until the keyframe after the group is measured
+    relative to the tail. Otherwise, that keyframe might be measured only relative to keyframes
+    inside the group. Condensation would transfer these measurements to the head or the tail, and
+    later corrections would move the keyframe with this variable only.
 
     Args:
         active: Keyframes that may still be condensed, ascending (`FactorStore.active`).

@@ -1,4 +1,4 @@
-"""Store of all measurements of keyframes and landmarks, which builds their factors."""
+"""Store of all measurements of keyframes and landmarks, and construction of their factors."""
 
 from collections.abc import Callable, Iterable, Mapping, Set
 from typing import Any
@@ -34,11 +34,11 @@ from .solver import Name, Variables, point_key
 
 
 class FactorStore:
-    """Store of all measurements by kind, which builds their factors.
+    """Store of all measurements by kind; it builds the factors of the pose graph.
 
-    A factor connects variables, and a condensed keyframe is not a variable. In its measurements, it
-    is therefore replaced by the nearer one of its head and its tail, the last variable before it
-    and the first variable after it (see `condensation.CondensedKeyframes`).
+    A factor connects variables, and a condensed keyframe is not a variable. In its measurements,
+    the keyframe is therefore replaced by its head (the last variable before it) or its tail (the
+    first variable after it), whichever is nearer.
     """
 
     def __init__(self, noise: NoiseConfig, closures: LoopClosureConfig) -> None:
@@ -114,9 +114,9 @@ class FactorStore:
         """Condense a group of keyframes: only the first and the last one remain variables.
 
         One measurement from the first to the last keyframe replaces all measurements and closures
-        within the group. Measurements from condensed keyframes to keyframes outside the group are
-        dropped, since those outside usually have others. If the graph would not be connected
-        without a measurement, it is converted by `between_variables` and kept.
+        within the group. A measurement between a condensed keyframe and a keyframe outside the
+        group is dropped, unless it is needed to keep the graph connected. In this case, it is
+        converted by `between_variables`.
 
         Args:
             group: Ids of the keyframes, in order.
@@ -143,9 +143,9 @@ class FactorStore:
     def restore_variable(self, keyframe: int) -> None:
         """Make a condensed keyframe a variable again.
 
-        The measurement from the variable before it to the variable after it is replaced by two: one
-        to the keyframe, and one from it. The covariance of the replaced measurement is divided
-        between them in proportion to `CondensedKeyframes.fractions`.
+        So far, one measurement connects the variables before and after the keyframe. It is replaced
+        by two measurements, one to the keyframe and one from the keyframe. They share its
+        covariance in proportion to `CondensedKeyframes.fractions`.
         """
         row = self.rows[keyframe]
         head, tail = self.interpolated.head_and_tail(row)
@@ -163,13 +163,13 @@ class FactorStore:
     def interpolation_error_sigmas(self, keyframe: int, variables: Variables) -> float:
         """Return the difference between two estimates of the pose of a condensed keyframe.
 
-        One follows from the last variable before the keyframe, the other from the first one after.
+        One estimate uses the variable before the keyframe, the other the variable after it.
 
         Returns:
             The largest absolute component of the difference, in standard deviations of a loop
-            closure (`sigma_loop_rad`, `sigma_loop_m`). It is multiplied by the distance of the
-            keyframe from the nearer variable, as a fraction, 0..0.5, of the path between the
-            variables. The result is 0 if the keyframe is a variable.
+            closure (`sigma_loop_rad`, `sigma_loop_m`), times min(f, 1 - f). Here f is the position
+            of the keyframe between both variables, 0..1 (`CondensedKeyframes.fractions`). The
+            result is 0 if the keyframe is a variable.
         """
         row = self.rows.get(keyframe)
         if row is None:
@@ -193,9 +193,9 @@ class FactorStore:
 
     # --- condensed keyframes ----------------------------------------------------------------------
     def relative_to_start(self, keyframe: int) -> tuple[int, np.ndarray]:
-        """Return the head of a keyframe, and T_head_keyframe [4, 4]; a variable is its own head.
+        """Return the head of a keyframe, and T_head_keyframe [4, 4].
 
-        The head is the last keyframe before it that is a variable of the pose graph.
+        The head is the last variable before the keyframe. A variable is its own head.
         """
         row = self.rows.get(keyframe)
         if row is None:
@@ -203,10 +203,10 @@ class FactorStore:
         return int(self.interpolated.start_variables[row]), self.interpolated.T_head[row]
 
     def relative_to_variable(self, keyframe: int) -> tuple[int, np.ndarray]:
-        """Return the nearer one of head and tail of a keyframe, and T_variable_keyframe [4, 4].
+        """Return the variable nearest to a keyframe, and T_variable_keyframe [4, 4].
 
-        Head and tail are the last variable of the pose graph before the keyframe and the first one
-        after it. A keyframe that is a variable is its own head and tail.
+        The variable is the last one before the keyframe or the first one after it. A keyframe that
+        is a variable itself is returned with the identity.
         """
         row = self.rows.get(keyframe)
         if row is None or self.interpolated.fractions[row] <= 0.5:
@@ -216,9 +216,9 @@ class FactorStore:
     def ends(self, m: RelativePose) -> tuple[tuple[int, np.ndarray], tuple[int, np.ndarray]]:
         """Return the two variables that replace the keyframes a and b of a measurement.
 
-        A keyframe that is a variable is kept. A condensed keyframe is replaced by the nearer one of
-        its head, the last variable before it, and its tail, the first variable after it. If this
-        gives the same variable for a and b, both are replaced by their heads instead.
+        A keyframe that is a variable is kept. A condensed keyframe is replaced by its head (the
+        last variable before it) or its tail (the first variable after it), whichever is nearer. If
+        a and b get the same variable, both are replaced by their heads instead.
 
         Returns:
             For a, then for b: the id of the variable, and T_variable_keyframe [4, 4].
@@ -311,7 +311,7 @@ class FactorStore:
         return [*others, *(self._closure_factor(closure, 0.0) for closure in closures)]
 
     def closure_sigmas(self, variables: Variables, closure: RelativePose) -> float:
-        """Return the largest absolute component of a closure's residual [6], in its sigmas."""
+        """Return the largest component of the whitened residual of a closure, in sigmas."""
         m = self._closure(closure)
         residual = closure_residual(variables[m.a], variables[m.b], m)
         return float(np.abs(np.linalg.cholesky(m.information).T @ residual).max())
@@ -361,7 +361,7 @@ class FactorStore:
         return {k: moved.get(k, value) for k, value in variables.items()}
 
     def keep_rejected(self, closure: RelativePose) -> None:
-        """Store a closure that contradicts a merge of components; keep only the newest ones."""
+        """Store a rejected loop closure, and keep only the newest `max_contradicting` ones."""
         contradicting = {**self.contradicting, pair_of(closure): closure}
         self.contradicting = dict(
             list(contradicting.items())[-self.closures.config.max_contradicting :]

@@ -18,9 +18,10 @@ from .solver import point_key
 
 @dataclass(frozen=True, slots=True)
 class NoiseConfig:
-    """Noise of measurements: bounds of the noise that a measurement states, and noise added to it.
+    """Parameters of the noise of measurements.
 
-    A measurement of a relative pose states its own noise by an information matrix.
+    A relative-pose measurement comes with an information matrix. These parameters bound its
+    covariance, and add noise that the matrix does not contain, such as odometry drift.
     """
 
     # Sigma of the prior that fixes the first keyframe of each component, rad and m.
@@ -65,7 +66,11 @@ class NoiseConfig:
         if min(getattr(self, name) for name in sigmas) <= 0:
             raise ConfigError(named(self, *sigmas) + " must be positive.")
         if min(getattr(self, name) for name in optional) < 0:
-            raise ConfigError(named(self, *optional) + " must not be negative.")
+            raise ConfigError(
+                named(self, *optional)
+                + ": drift_rad_per_sqrt_m, drift_m_per_sqrt_m and turn_m_per_rad must not be "
+                "negative."
+            )
         if self.independent_observations > 1:
             raise ConfigError(named(self, "independent_observations") + " must be at most 1.")
 
@@ -100,7 +105,7 @@ class BoxObservation:
 
 
 def information(sigma_rad: float, sigma_m: float) -> np.ndarray:
-    """Return the diagonal information matrix [6, 6] of two standard deviations, rotation first."""
+    """Return the diagonal information matrix [6, 6] for sigmas of rotation and translation."""
     return np.diag([sigma_rad**-2] * 3 + [sigma_m**-2] * 3)
 
 
@@ -125,8 +130,8 @@ def closure_information(
     Args:
         measured: The closure.
         noise: Noise of the measurements.
-        covariance: Covariance [6, 6] of transferring the closure from condensed keyframes to
-            variables; zero if both keyframes are variables.
+        covariance: Covariance [6, 6] that is added when the closure is transferred from condensed
+            keyframes to variables. It is zero if both keyframes are variables.
     """
     own = 0.5 * (measured.information + measured.information.T) + noise.floor
     least = np.linalg.inv(information(noise.sigma_loop_rad, noise.sigma_loop_m))
@@ -199,7 +204,7 @@ def closure_residual(T_a: np.ndarray, T_b: np.ndarray, measured: RelativePose) -
     Args:
         T_a: Pose of keyframe a in the map, [4, 4].
         T_b: Pose of keyframe b in the map, [4, 4].
-        measured: The closure, with T_ab.
+        measured: The closure; T_ab is its measured pose of keyframe b in keyframe a.
     """
     return se3.log(se3.inverse(measured.T_a_b) @ se3.inverse(T_a) @ T_b)
 

@@ -1,6 +1,6 @@
 """Fusion of the observed class distributions of landmarks.
 
-It minimizes G(p), which `ldo_service.pose_graph` defines.
+The fusion minimizes the cost G(p) of the class distributions p (see `ldo_service.pose_graph`).
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -20,9 +20,11 @@ NEWTON_STEPS = 60
 class Evidence:
     """Observed class distributions of a landmark, summed over all its observations.
 
-    The cost G(p) of `ldo_service.pose_graph` depends on the observations only through these sums:
+    Observation k has the class distribution q_k and the weight w_k. The cost of a distribution p
+    depends on the observations only through the sums W and L:
 
-    sum_k w_k KL(p || q_k) = W sum_c p_c log p_c - sum_c p_c L_c,  W = sum w_k, L = sum w_k log q_k
+        sum_k w_k KL(p || q_k) = W sum_c p_c log p_c - sum_c p_c L_c
+        W = sum_k w_k,    L = sum_k w_k log q_k
     """
 
     weight: float  # W.
@@ -56,18 +58,21 @@ def fuse_labels(
     sweeps: int = 20,
     tolerance: float = 1e-9,
 ) -> dict[int, np.ndarray]:
-    """Return the distribution p_l [C] of every landmark, in the order of their ids.
+    """Return the fused class distribution p_l [C] of every landmark l, in the order of their ids.
+
+    The distributions minimize this sum:
 
         min_p  lambda sum_lk w_k KL(p_l || q_lk)
              + w_sem / 2 sum_ij (KL(p_i || p_j) + KL(p_j || p_i)) [argmax p_i = argmax p_j]
 
-    q_lk and w_k are distribution and weight of the observation of landmark l in keyframe k. The
-    method is Gauss-Seidel (LDO-SLAM paper, III.C): each sweep minimizes over one landmark after the
-    other, in the order of their ids. The neighbors with equal argmax are determined again each time
-    that a landmark is minimized. The result is deterministic.
+    The observation of landmark l in keyframe k has the class distribution q_lk and the weight w_k.
+    The bracket is 1 if both landmarks have the same likeliest class, else 0. The method is
+    Gauss-Seidel (LDO-SLAM paper, III.C): each sweep minimizes over one landmark after the other, in
+    the order of their ids. Just before each of these steps, the neighbors of the landmark with the
+    same likeliest class are determined again. Equal arguments give equal results.
 
     Args:
-        evidence: Sums over the observations q_lk with weights w_k of each landmark l, by its id.
+        evidence: Sums over the observations of each landmark, by its id.
         covisible: Pairs of landmarks that are observed in the same keyframe; each pair counts once.
         lambda_sem: Weight of the observations.
         w_sem: Weight of the similarity.
@@ -98,7 +103,8 @@ def fuse_labels(
 def geometric_mean(evidence: Evidence) -> np.ndarray:
     """Return the weighted geometric mean of the observations, [C].
 
-    It minimizes sum_k w_k KL(p || q_k) over p, and is proportional to prod_k q_k^(w_k / W).
+    Observation k has the class distribution q_k and the weight w_k; W is the sum of the weights.
+    The mean minimizes sum_k w_k KL(p || q_k) over p, and is proportional to prod_k q_k^(w_k / W).
     """
     mean = evidence.log_sum / max(evidence.weight, np.finfo(float).tiny)
     p = np.exp(mean - mean.max())
@@ -112,13 +118,14 @@ def objective(
     lambda_sem: float = 0.5,
     w_sem: float = 0.1,
 ) -> float:
-    """Return the cost G(p) of class distributions, which `ldo_service.pose_graph` defines.
+    """Return the cost G(p) of the class distributions p of all landmarks.
 
-    A constant that does not depend on p is left out.
+    The formula of G is in `ldo_service.pose_graph`. A constant that does not depend on p is left
+    out.
 
     Args:
-        p: Class distribution [C] of each landmark, by landmark.
-        evidence: Observed distributions of each landmark, by landmark.
+        p: Class distribution [C] of each landmark, by landmark id.
+        evidence: Observed distributions of each landmark, by landmark id.
         pairs: Pairs of landmarks that count as similar, even if their likeliest labels differ.
         lambda_sem: Weight of the observations.
         w_sem: Weight of the similarity.

@@ -22,11 +22,11 @@ BORDER_PX = 2.0  # A box closer to the border of the image counts as cut off.
 def triangulate(origins: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the point [3] nearest to all rays, and the largest angle between two rays in rad.
 
-        min_x sum_i |(I - d_i d_i^T) (x - o_i)|^2
+    The point x minimizes sum_i |(I - d_i d_i^T) (x - o_i)|^2.
 
     Args:
-        origins: Origins of N >= 2 rays, [N, 3], meters.
-        rays: Directions of any length, [N, 3].
+        origins: Origins o_i of N >= 2 rays, [N, 3], meters.
+        rays: Directions of any length, [N, 3]; d_i are the same directions with length 1.
 
     Raises:
         LinAlgError: All rays are parallel.
@@ -41,7 +41,7 @@ def triangulate(origins: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, floa
 class ObjectLandmarkConfig:
     """Settings of object landmarks.
 
-    Names with `vague` concern uncertain labels, those whose entropy is above `vague_nats`.
+    Settings with `vague` in the name apply to labels whose entropy is above `vague_nats`.
     """
 
     lambda_sem: float = 0.5  # Weight of the observed labels (LDO-SLAM paper, III.C).
@@ -94,12 +94,12 @@ class ObjectLandmarkConfig:
                     "max_landmarks",
                     "max_waiting",
                 )
-                + " must be at least 1, and min_observations at least 2."
+                + ": min_observations must be at least 2, the other values must be at least 1."
             )
         if min(self.lambda_sem, self.due_weight, self.min_parallax_rad) <= 0 or self.w_sem < 0:
             raise ConfigError(
                 named(self, "lambda_sem", "w_sem", "min_parallax_rad", "due_weight")
-                + " must be positive, except w_sem, which must not be negative."
+                + ": w_sem must not be negative, the other values must be positive."
             )
 
 
@@ -129,7 +129,7 @@ class LandmarkObservation:
     def pack(self) -> dict[str, Any]:
         """Return the fields as plain values.
 
-        The label distribution is stored sparsely: few of its 256 probabilities are not zero.
+        The label distribution is stored sparsely: most of its 256 probabilities are zero.
         """
         values = {name: getattr(self, name) for name in self.__slots__}
         labels = np.flatnonzero(self.distribution)
@@ -171,8 +171,8 @@ class ObjectLandmarks:
     """Landmarks of the pose graph, with their observations and fused class distributions.
 
     Equal observations in the same order give equal landmarks. There are at most `max_landmarks`
-    landmarks, each with 4 kB and at most `max_observations` observations. In addition, all pairs of
-    landmarks that are observed in the same keyframe are stored.
+    landmarks. Each has at most `max_observations` observations and needs 4 kB. In addition, all
+    pairs of landmarks that are observed in the same keyframe are stored.
     """
 
     def __init__(self, config: ObjectLandmarkConfig, noise: NoiseConfig) -> None:
@@ -190,7 +190,7 @@ class ObjectLandmarks:
         self._waiting.append(seen)
 
     def weight(self, entropy: float) -> float:
-        """Return the weight 0..1 of an observation, from the entropy of its classes in nats."""
+        """Return the weight 0..1 of an observation whose labels have this entropy, nats."""
         return float(np.exp(-2 * entropy)) if entropy > self._config.vague_nats else 1.0
 
     # --- into the graph ---------------------------------------------------------------------------

@@ -27,7 +27,7 @@ Sigmas = Callable[[Variables, RelativePose], float]
 class LoopClosureConfig:
     """Limits for the acceptance of loop closures.
 
-    A residual in sigmas is divided by the standard deviation of the measurement.
+    Limits in sigmas are multiples of the standard deviation of the measurement.
     """
 
     # Maximum increase of the sum of squared residuals by a closure: the 99.73 % quantile (3
@@ -53,18 +53,18 @@ class LoopClosureConfig:
         if min(self.max_cost, self.max_sigmas) <= 0 or self.max_removal_tests < 0:
             raise ConfigError(
                 named(self, "max_cost", "max_sigmas", "max_removal_tests")
-                + " must be positive, except max_removal_tests, which must not be negative."
+                + ": max_cost and max_sigmas must be positive, max_removal_tests at least 0."
             )
         if min(self.max_closures, self.max_contradicting, self.max_rejected) < 1:
             raise ConfigError(
                 named(self, "max_closures", "max_contradicting", "max_rejected")
-                + " must be at least 1."
+                + ": max_closures, max_contradicting and max_rejected must be at least 1."
             )
 
 
 @dataclass(frozen=True, slots=True)
 class ClosureDecision:
-    """Decision on a loop closure."""
+    """Decision to accept or to reject a loop closure."""
 
     is_accepted: bool
     dropped: tuple[Pair, ...] = ()  # Earlier accepted closures that are now removed.
@@ -187,7 +187,7 @@ class LoopClosureSet:
     def without(self, pairs: Collection[Pair]) -> "LoopClosureSet":
         """Return the set without the closures between some pairs of keyframes.
 
-        They are not listed as removed, since other measurements now contain their information.
+        The closures are not listed as removed, since other measurements contain their information.
         """
         return replace(self, accepted={p: c for p, c in self.accepted.items() if p not in pairs})
 

@@ -31,9 +31,9 @@ from .solver import Name, Solver, Variables, point_key
 class PoseGraph:
     """Pose graph of keyframes and landmarks, solved incrementally by iSAM2.
 
-    It minimizes F(T, mu), which `ldo_service.pose_graph` defines, over all variables. Keyframes
-    that are connected by measurements form a component, whose first keyframe stays fixed. A
-    measurement between two components merges them into the coordinate frame of the older one.
+    The solver minimizes the cost F of keyframe poses and landmark positions; its formula is in
+    `ldo_service.pose_graph`. Keyframes that measurements connect form a component, whose first
+    keyframe stays fixed. A measurement between two components merges them in the older one's frame.
 
     The state of iSAM2 cannot be saved, and a new solver with the same measurements differs in the
     last digits. Therefore a snapshot contains the values at the last rebuild of the solver and all
@@ -127,8 +127,8 @@ class PoseGraph:
     def odometry_fallback(self, a: int, b: int, T_a_b: np.ndarray) -> RelativePose:
         """Return the odometry pose T_a_b [4, 4] between two keyframes as a measurement.
 
-        Use it to connect keyframes `a` and `b` if keyframes between them were missed. Its noise is
-        larger than that of an alignment; see `NoiseConfig.sigma_odometry_m`.
+        The measurement can connect `a` and `b` if keyframes between them were missed. It has more
+        noise than a measurement by alignment; see `NoiseConfig.sigma_odometry_m`.
         """
         noise = self._config.noise
         own = information(noise.sigma_odometry_rad, noise.sigma_odometry_m)

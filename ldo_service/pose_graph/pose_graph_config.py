@@ -12,8 +12,8 @@ from .loop_closures import LoopClosureConfig
 class PoseGraphConfig:
     """Parameters of the pose graph.
 
-    The variables of the graph are keyframes. A condensed keyframe is no variable: its pose is
-    interpolated between the variables before and after it.
+    The pose of a keyframe is a variable of the graph until the keyframe is condensed. The pose of a
+    condensed keyframe is interpolated between the variables before and after it.
     """
 
     noise: NoiseConfig = field(default_factory=NoiseConfig)
@@ -40,7 +40,8 @@ class PoseGraphConfig:
                 named(
                     self, "condense_keyframes", "window_keyframes", "keyframes_each", "max_changes"
                 )
-                + " must be at least 1."
+                + ": condense_keyframes, window_keyframes, keyframes_each and max_changes must be "
+                "at least 1."
             )
         if self.max_interpolation_sigmas < 0:
             raise ConfigError(named(self, "max_interpolation_sigmas") + " must not be negative.")

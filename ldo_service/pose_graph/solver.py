@@ -18,7 +18,7 @@ Variables = dict[int, np.ndarray]
 class Solver:
     """Incremental minimization of a sum of named factors by iSAM2.
 
-    An update linearizes again at the variables that have moved by more than 0.01 rad or m.
+    An update relinearizes the variables that have moved by more than 0.01 rad or 0.01 m.
     """
 
     def __init__(self) -> None:
@@ -99,7 +99,7 @@ def values_of(variables: Variables) -> gtsam.Values:
 def variables_of(values: gtsam.Values) -> Variables:
     """Return values of gtsam as variables.
 
-    Keyframes have smaller keys than points, and gtsam returns both in the order of their keys.
+    The variables are in the order of their keys: first the keyframes, then the landmarks.
     """
     rows = gtsam.utilities.extractPose3(values).reshape(-1, 12)
     T = np.tile(np.eye(4), (len(rows), 1, 1))

@@ -2,7 +2,8 @@
 
 A saved state of the mapper refers to files in the mapper's folder, so a restored mapper needs the
 state and the files. The folder `<actor>.files` of a recording holds these files. `Started.files`
-lists the files of one start, each with its CRC-32. A file that several starts need is stored once.
+lists the files that one start of the actor needs, each with its CRC-32. A file that several starts
+need is stored once.
 """
 
 import errno
@@ -93,10 +94,10 @@ class FileArchive:
         return checksums
 
     def restore(self, checksums: Mapping[str, str], folder: Path) -> None:
-        """Replace the content of an actor's folder by the files that it had at a recorded start.
+        """Replace the content of an actor's folder by the files of a recorded start of the actor.
 
-        The files become symbolic links to the recording. An actor may remove or replace them, which
-        does not change the recording.
+        The files become symbolic links to the recording. If the actor removes or replaces a link,
+        the recording does not change.
 
         Args:
             checksums: The CRC-32 of each file by its path, as `add` returned them.

@@ -106,7 +106,7 @@ class McapIndex:
 
     def _read_index(self, file: BinaryIO, size: int) -> None:
         if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-            raise ValueError("it is not an MCAP file")
+            raise ValueError("the file is not an MCAP file")
         for opcode, start, length in _records(file, size):
             if opcode == Opcode.CHUNK:
                 data = _read_chunk(file)
@@ -193,7 +193,7 @@ class RecordConfig:
 
 
 def recording_bytes(folder: Path) -> int:
-    """Return the size of a recording: its MCAP files and the files of its actors."""
+    """Return the size of a recording in bytes, with its MCAP files and the files of its actors."""
     total = 0
     for name in (path for path in folder.iterdir() if path.suffix in (".mcap", FILES_SUFFIX)):
         for file in os.scandir(name) if name.is_dir() else (name,):
@@ -205,7 +205,7 @@ def recording_bytes(folder: Path) -> int:
 class RecordingFile:
     """New MCAP file, which only one thread may write.
 
-    After an error or a limit, the file is closed and further messages are ignored.
+    After an error, or when a limit is reached, the file is closed and further messages are ignored.
     """
 
     def __init__(self, path: Path, about: Mapping[str, str], config: RecordConfig) -> None:
@@ -273,7 +273,8 @@ class RecordingFile:
     def is_over_limit(self) -> bool:
         """Return whether the folder exceeds `max_gb`, or less than `min_free_gb` of disk is free.
 
-        The sizes are checked after every `CHECK_EVERY_BYTES`; between checks the result is False.
+        The sizes are checked each time `CHECK_EVERY_BYTES` have been written. Between two checks,
+        the result is False.
         """
         if self._unchecked < CHECK_EVERY_BYTES:
             return False
@@ -284,7 +285,7 @@ class RecordingFile:
         return self._used > self._config.max_gb * 1e9 or free < self._config.min_free_gb * 1e9
 
     def metrics(self) -> dict[str, float]:
-        """Return sizes and limits, MB; empty if the file is closed, because it then has no limit.
+        """Return sizes and limits of the recording in MB, or an empty dict if the file is closed.
 
         `recording_mb` is the size of the folder at the last check, plus the messages that were
         written to this file since.

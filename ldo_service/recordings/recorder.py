@@ -104,9 +104,12 @@ class Recorder(Journal):
             )
 
     def record_start(self, state: State | None) -> None:
-        """Record the start of an actor with its restored state, or None if it starts without one.
+        """Record the start of an actor with its restored state.
 
         If the state or a file cannot be recorded, a gap is recorded instead.
+
+        Args:
+            state: The restored state; None if the actor starts without a state.
         """
         try:
             parts = None if state is None else {k: encode_state(v) for k, v in state.items()}

@@ -117,11 +117,10 @@ def _files_by_process(folder: Path) -> dict[str, dict[int, Path]]:
 def prepare_recording(folder: Path) -> None:
     """Create the folder of a recording, or continue the recording in it.
 
-    A restarted service continues its recording: each of its processes writes new files, as after
-    the restart of an actor.
+    After a restart of the service, each of its processes writes a new file into the same folder.
 
     Raises:
-        ConfigError: The folder contains something else, or cannot be written.
+        ConfigError: The folder contains other files and no recording, or cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,8 +1,8 @@
-"""Replay of a recorded actor with the same inputs, flow status and restarts.
+"""Replay of a recorded actor with the recorded inputs, flow status (`FlowStatus`) and restarts.
 
-The outputs must have the digests of the recording. A step that failed when it was recorded had no
-effect on the actor's state. The replay therefore continues even if such a step succeeds now, and
-counts the steps that fail again.
+The replayed outputs must have the same digests as the recorded outputs. A step that failed in the
+recording had no effect on the actor's state. The replay therefore continues even if such a step now
+succeeds. The report counts the steps that fail again.
 """
 
 from collections import Counter
@@ -79,11 +79,11 @@ def replay(
 
     Args:
         actor: Name of the actor.
-        files: Recorded files of the actor, in the order of its processes.
-        make: Function that creates a new actor from the metadata of a file.
+        files: Recorded journals, one for each process of the actor, in the order of the processes.
+        make: Function that creates a new actor from the metadata of a journal.
         advance: Function that is called after each step.
-        folder: Temporary folder for the files of the actor; None if the actor has no files. At each
-            recorded start, the recorded files replace the content of the folder.
+        folder: Temporary folder for the files to which the actor's state refers; None if there are
+            none. At each recorded start, the recorded files replace the content of the folder.
 
     Returns:
         The counters and the first difference, if there is one.
@@ -102,7 +102,7 @@ def replay(
 
 
 class ReplaySession:
-    """Replay of one file, step by step."""
+    """Replay of one recorded journal, step by step."""
 
     def __init__(
         self,

@@ -37,17 +37,17 @@ class ForegroundConfig:
         if not (min(shares) >= 0 and max(self.min_cosine, self.min_inside) <= 1):
             raise ConfigError(
                 named(self, "max_step", "min_cosine", "min_inside", "max_gap", "near_mode")
-                + ": each must be at least 0, min_cosine and min_inside at most 1."
+                + ": these must be at least 0; min_cosine and min_inside must be at most 1."
             )
         if max(shares) > MAX_RATIO:
             raise ConfigError(
                 named(self, "max_step", "min_cosine", "min_inside", "max_gap", "near_mode")
-                + f": each must be at most {MAX_RATIO:g}; larger values have no further effect."
+                + f": these settings must be at most {MAX_RATIO:g}."
             )
         if not (1e-4 <= self.depth_bin <= 1 and 0 <= self.grow_px <= 64):
             raise ConfigError(
                 named(self, "depth_bin", "grow_px")
-                + ": depth_bin must be in 1e-4..1, grow_px in 0..64."
+                + ": depth_bin must be in 1e-4..1, and grow_px must be in 0..64."
             )
 
 
@@ -58,7 +58,7 @@ class SmoothSurfaces:
     Attributes:
         labels: Number of the surface of each pixel, [H, W] int32; 0 on edges and where depth is
             unknown.
-        sizes: Number of pixels with each label, [S] int64.
+        sizes: Number of pixels with each of the labels 0..S-1, [S] int64.
     """
 
     labels: np.ndarray
@@ -80,7 +80,7 @@ class Foreground:
     mask: np.ndarray
 
     def image(self, shape: tuple[int, ...]) -> np.ndarray:
-        """Return the mask for the whole image of this shape, [H, W] bool."""
+        """Return the mask as a whole image of the given shape, [H, W] bool."""
         out = np.zeros(shape, bool)
         height, width = self.mask.shape
         out[self.row : self.row + height, self.column : self.column + width] = self.mask
@@ -112,14 +112,13 @@ class Foreground:
 def surfaces(depth_m: np.ndarray, camera: Camera, config: ForegroundConfig) -> SmoothSurfaces:
     """Find the smooth surfaces of a depth image, which end at depth steps and creases.
 
-    One call per keyframe is enough for all boxes; it takes 0.8 ms for 640x480 pixels. A pixel
-    belongs to a surface if two conditions hold:
+    One call per keyframe is enough for all boxes of the detector. A call takes 0.8 ms for 640x480
+    pixels. A pixel belongs to a surface if two conditions hold:
 
-    - All depths within its 3x3 pixels are known, and no two of them differ by more than the
-      fraction max_step.
-    - The cosine between the normals two pixels to the left and two pixels to the right is above
-      min_cosine. The same holds for the normals two pixels above and two pixels below. The normals
-      are computed from blurred depth.
+    - All depths in the 3x3 pixels around it are known, and no two of these depths differ by more
+      than the fraction max_step.
+    - The normals 2 px to its left and 2 px to its right have a cosine above min_cosine. So do the
+      normals 2 px above it and 2 px below it. The normals are computed from blurred depth.
 
     Two such pixels that share a side belong to the same surface. Surfaces are numbered from 1 in
     the order of their first pixels, row by row. If a cosine is exactly at its threshold, the result
@@ -134,7 +133,10 @@ def surfaces(depth_m: np.ndarray, camera: Camera, config: ForegroundConfig) -> S
         ValueError: If depth_m does not have the size of the camera's images.
     """
     if depth_m.shape != (camera.height, camera.width):
-        raise ValueError(f"depth_m has shape {depth_m.shape}, must have the size of {camera}.")
+        raise ValueError(
+            f"depth_m has shape {depth_m.shape}, but the camera's images have shape "
+            f"{camera.height, camera.width}. Give the camera of the depth image."
+        )
     labels = np.empty(depth_m.shape, np.int32)
     sizes = _foreground.surfaces(
         np.ascontiguousarray(depth_m, np.float32),
@@ -162,10 +164,11 @@ def foreground(
     belong to the object if two conditions hold:
 
     - The pixel lies on an edge, or on a surface that lies mostly inside the box.
-    - Its depth differs from the object's depth by less than the size of the box in meters.
+    - Its depth differs from the object's depth by less than the longer side of the box in meters,
+      or by less than the fraction near_mode of the object's depth.
 
-    The object consists of such pixels that are connected, without depth steps above max_gap, to
-    pixels at the object's depth in the middle half of the box.
+    Such pixels form connected parts without depth steps above max_gap. The mask consists of the
+    parts that contain at least a tenth of the pixels at the object's depth in the middle half.
 
     Args:
         box: The box, [4], x0 y0 x1 y1, pixels.
@@ -175,8 +178,8 @@ def foreground(
         config: Settings.
 
     Returns:
-        The mask of the object, without any pixel if the depth is unknown or the box shows only a
-        wall.
+        The mask of the object. The mask has no pixels if the depth is unknown, or if the box shows
+        only a wall.
 
     Raises:
         ValueError: If the surfaces have another size than the depth image.
@@ -216,8 +219,8 @@ def pixels_of(box: np.ndarray, shape: tuple[int, ...]) -> tuple[slice, slice]:
 class NestingConfig:
     """Settings of nested regions: an object in front of a larger one, such as a cup on a table.
 
-    The smaller region gets the pixels that both regions have. If the scores decided, a table with a
-    score of 0.9 would get the pixels of a cup with a score of 0.5.
+    The smaller region gets the pixels that both regions contain. The scores do not decide: a table
+    with a score of 0.9 would then get the pixels of a cup with a score of 0.5.
     """
 
     inside: float = 0.8  # Minimum fraction of the smaller region that lies in the larger region.
@@ -231,7 +234,7 @@ class NestingConfig:
         if not (0 < self.inside <= 1 and self.times > 1 and self.min_score >= 0):
             raise ConfigError(
                 named(self, "inside", "times", "min_score")
-                + ": inside must be in (0, 1], times above 1, min_score not negative."
+                + ": inside must be in (0, 1], times above 1, and min_score at least 0."
             )
 
 
@@ -242,8 +245,8 @@ def without_nested(
 
     Args:
         parts: The masks, M.
-        scores: Scores of the masks, [M]. A mask with a score below `min_score` is not removed from
-            larger masks.
+        scores: Scores of the masks, [M]. The pixels of a mask with a score below `min_score` stay
+            in the larger masks.
         config: Settings.
 
     Returns:
@@ -294,12 +297,13 @@ class RegionDetections:
 
     Attributes:
         boxes: Boxes, [M, 4], x0 y0 x1 y1, pixels, with pixel centers at integers.
-        labels: Labels by the detector, [M]; unused where its confidence is 0.
+        labels: Label ids by the detector, [M]; unused where the detector's confidence is 0.
         confidences: Confidences of the detector, [M], 0..1; 0 without a detection.
-        open_labels: Labels by the open-vocabulary labeller, [M]; unused where its confidence is 0.
+        open_labels: Label ids by the open-vocabulary labeller, [M]; unused where the labeller's
+            confidence is 0.
         open_confidences: Confidences of the labeller, [M], 0..1; 0 without a label by the labeller.
-        parts: Mask of the object in each box. For a box with None, or for all boxes if the tuple is
-            empty, the foreground is computed later.
+        parts: Mask of the object in each box. If a mask is None, the foreground of the box is
+            computed later. An empty tuple means None for all boxes.
         replaces_labels: True if the earlier labels of the Gaussians in the regions must be deleted,
             because those labels describe another object.
     """
@@ -331,7 +335,7 @@ class RegionDetections:
         return cls.of_detector(np.zeros((0, 4), np.float32), *np.zeros((2, 0), np.float32))
 
     def where(self, mask: np.ndarray) -> "RegionDetections":
-        """Return the detections of the boxes where a mask [M] is true."""
+        """Return the detections of the boxes for which `mask`, [M] bool, is true."""
         parts = tuple(part for part, is_in in zip(self.parts, mask, strict=False) if is_in)
         return RegionDetections(
             self.boxes[mask],
@@ -356,7 +360,7 @@ class RegionDetections:
         return np.stack([np.where(sure > 0, one.astype(int), -1) for one, sure in sources], axis=1)
 
     def pack(self) -> list[np.ndarray]:
-        """Return all arrays except the masks, for a checkpoint of detections without masks."""
+        """Return the boxes, labels and confidences for a checkpoint; the masks are omitted."""
         labels = self.labels, self.confidences, self.open_labels, self.open_confidences
         return [self.boxes, *labels]
 

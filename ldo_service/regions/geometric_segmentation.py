@@ -5,7 +5,7 @@ A segment has one of five kinds:
     apart      a connected surface without depth steps that is not on a structural plane (`planes`)
     standing   a part of a segment `apart` that stands on a flat surface: a cup on a table
     convex     a part of a segment `apart` between concave creases: a cabinet next to an oven
-    flat       a part of a structural plane with another color: a picture, a window, a rug
+    flat       a part of a structural plane in another color than the plane: a picture, a rug
     room       a structural plane, which is no object but may appear in an object's box
 
 Convex segments follow Stein et al., CVPR 2014: objects are convex, and creases between them are
@@ -43,8 +43,8 @@ _3X3 = np.ones((3, 3), np.uint8)
 class GeometricSegmentationConfig:
     """Settings of the segmentation of a keyframe by geometry and color.
 
-    Names that end in `_px` are in pixels of the small image, see `PlaneConfig`. The values were
-    chosen on the same data as those of `PlaneConfig`.
+    Settings that end in `_px` are in pixels of the small image, which is the depth image scaled
+    down (see `PlaneConfig`). The values were chosen on the sequence `synthetic:flat`.
     """
 
     planes: PlaneConfig = field(default_factory=PlaneConfig)
@@ -66,7 +66,7 @@ class GeometricSegmentationConfig:
         if min(self.max_gap, self.crease, self.color_step, self.color_gap) <= 0:
             raise ConfigError(
                 named(self, "max_gap", "crease", "color_step", "color_gap")
-                + ": each must be positive."
+                + ": these settings must be positive."
             )
 
 
@@ -121,7 +121,7 @@ def segment_geometry(
 
 
 def components(mask: np.ndarray, min_px: int = 1) -> Iterator[Foreground]:
-    """Yield the 4-connected components of a mask [H, W] bool with at least `min_px` pixels."""
+    """Yield each 4-connected component of a mask, [H, W] bool, of at least `min_px` pixels."""
     count, parts, boxes, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     for part in range(1, count):
         column, row, width, height, area = (int(value) for value in boxes[part])

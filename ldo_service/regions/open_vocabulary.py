@@ -1,9 +1,9 @@
 """Label requests to an open-vocabulary labeller, and use of its results (LDO-SLAM paper, III.B).
 
-A label result arrives later than its keyframe. It labels the pixels of a region in that keyframe,
-so box and mask of the region are stored until the result arrives. The result is also stored as a
-vote of the region, next to the votes of the detector's boxes. Later keyframes that observe the
-region get the label too.
+A label result arrives later than the keyframe of its request. The result labels the pixels of a
+region in that keyframe, so the region's box and mask are stored until then. The result also counts
+as a vote for the region's label, as the boxes of the detector do. Later keyframes that observe the
+region get the region's label too.
 """
 
 from collections.abc import Mapping, Sequence
@@ -56,17 +56,17 @@ class OpenVocabularyConfig:
         if not (0 <= self.reliable <= 1 and 0 <= self.min_sure <= 1) or self.max_open < 1:
             raise ConfigError(
                 named(self, "reliable", "min_sure", "max_open")
-                + ": reliable and min_sure must be in [0, 1], max_open at least 1."
+                + ": reliable and min_sure must be in [0, 1], and max_open at least 1."
             )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PendingRequest:
-    """Region of a label request whose label result has not arrived.
+    """Label request whose result has not arrived, with the region in the keyframe of the request.
 
     Attributes:
-        box_px: Box of the region in the requested keyframe, [4], x0 y0 x1 y1, pixels.
-        part: Mask of the region in the requested keyframe.
+        box_px: Box of the region in that keyframe, [4], x0 y0 x1 y1, pixels.
+        part: Mask of the region in that keyframe.
         label: Label of the detector's box; empty without a box.
         score: Score of the detector's box, 0..1; 0 without a box.
         kind: Kind of the region, see `geometric_segmentation`; empty for the foreground of a box.
@@ -173,9 +173,9 @@ class OpenVocabularyLabeling:
             vocabulary: Vocabulary of the map.
 
         Returns:
-            One box with the labels by the detector and by the labeller. None if the result is not
-            used: it has no label or no pending request, or, with its vote counted, another label
-            still has the most votes of the region.
+            One box with the labels by the detector and by the labeller. None if the result has no
+            label, if no request for it is pending, or if another label has the most votes of the
+            region after the vote of the result is added.
         """
         pending = self._open.pop((region, keyframe), None)
         if pending is None:
@@ -278,7 +278,7 @@ class OpenVocabularyLabeling:
         *,
         is_fused: bool = True,
     ) -> "OpenVocabularyLabeling":
-        """Restore the labels from `pack`; the other arguments are those of the constructor."""
+        """Restore an instance from `pack`; `config` and `is_fused` are as in the constructor."""
         out = OpenVocabularyLabeling(config, is_fused=is_fused)
         out._regions = RegionTracker.unpack(packed["regions"], out.config.regions)
         out._open = {
@@ -306,19 +306,19 @@ class OpenVocabularyLabeling:
 def match_boxes_to_regions(
     boxes: int, found: Sequence[RegionProposal]
 ) -> tuple[Foreground | None, ...]:
-    """Return the mask of the region that belongs to each of the detector's boxes.
+    """Return the masks of the regions that belong to the detector's boxes.
 
-    `RegionProposal.number` names the box of a region. If a segment found by depth and creases fits
-    the box, the mask is this segment. Otherwise, it is the foreground of the box without structural
-    planes. Segments found by color ("flat") are not used, because they include the edge of the
-    surface behind the object.
+    `RegionProposal.number` is the index of a region's box. If a segment found by depth and creases
+    fits the box, the mask is this segment. If no segment fits, the mask is the foreground of the
+    box without structural planes. Segments found by color ("flat") are not used, because they
+    include the edge of the surface behind the object.
 
     Args:
         boxes: Number of boxes.
         found: Regions of the keyframe, from `propose_regions`.
 
     Returns:
-        For each box, its mask; None if the box has no region.
+        The mask of each box; None if the box has no region or only a segment found by color.
     """
     parts: list[Foreground | None] = [None] * boxes
     for one in found:
@@ -335,10 +335,10 @@ def add_region_labels(
 ) -> RegionDetections:
     """Add the labels of regions to the detections of a keyframe.
 
-    The label of a region with a box becomes the box's label by the labeller
-    (`RegionDetections.open_labels`). If `boxes_vote`, the detector's label of the box is dropped,
-    because its vote is already a part of the region's label. A region without a box is added as a
-    new box, unless it is a part of a larger region with the same label.
+    If a region belongs to a box, the region's label becomes the labeller's label of the box
+    (`RegionDetections.open_labels`). If `boxes_vote` is true, the detector's label of the box is
+    dropped, because the region's label already includes its vote. A region without a box is added
+    as a new box, unless the region is a part of a larger region with the same label.
 
     Args:
         detections: Detections of the keyframe.

@@ -1,10 +1,11 @@
 """Planes of a keyframe, and its structural planes: walls, floors and ceilings.
 
-On a plane, inverse depth is linear in the image coordinates: n . (ray z) = d gives 1 / z =
-n . ray / d. Planes are therefore fitted to inverse depth by least squares. The noise of inverse
-depth is the same at all distances: 0.0014 / m for a Kinect.
+A pixel with depth z and viewing ray r = (x, y, 1) shows the point z r. If the point lies on the
+plane n . p = d, its inverse depth is 1 / z = n . r / d. Inverse depth is thus linear in the image
+coordinates, so planes are fitted to it by least squares. The noise of inverse depth is the same at
+all distances: 0.0014 / m for a Kinect.
 
-A plane is structural if almost no farther surface is visible along its outline. Floors and walls
+A plane is structural if almost no farther surface is visible past its outline. Floors and walls
 end where they meet each other or where an object in front hides them. A table top, a cabinet front
 or a seat ends where the camera sees a farther surface past its edge.
 """
@@ -25,9 +26,9 @@ _EPSILON = np.float32(1e-6)
 class PlaneConfig:
     """Settings of the planes that are fitted to the depth of a keyframe.
 
-    With these values, regions covered the objects of the sequence `synthetic:flat` best; no other
-    data were tried. Names that end in `_px` are in pixels of the small image, which is the depth
-    image scaled down to a width of about `width_px`.
+    With these values, the region proposals covered the objects of the sequence `synthetic:flat`
+    best. No other sequences were tried. Settings that end in `_px` are in pixels of the small
+    image, which is the depth image scaled down to a width of about `width_px`.
     """
 
     # Width of the small image; at this width, normals over a few pixels are stable enough.
@@ -55,22 +56,24 @@ class PlaneConfig:
         if not (min(shares) >= 0 and max(shares) <= 1):
             raise ConfigError(
                 named(self, "min_cosine", "max_step", "min_share", "behind")
-                + ": each must be in [0, 1]."
+                + ": these settings must be in [0, 1]."
             )
         if min(self.blur_px, self.tolerance, self.step_floor) <= 0 or self.width_px < 16:
             raise ConfigError(
                 named(self, "width_px", "blur_px", "step_floor", "tolerance")
-                + ": each must be positive, width_px at least 16."
+                + ": width_px must be at least 16, and the other settings must be positive."
             )
         if not 0 <= self.gap_px[0] < self.gap_px[1]:
             raise ConfigError(
-                named(self, "gap_px") + ": must be two ascending distances, not negative."
+                named(self, "gap_px") + ": both must be at least 0, and the second must be larger."
             )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DepthFeatures:
-    """Features of the small image, a depth image that was scaled down, [h, w] each.
+    """Features of the small image, which is a depth image scaled down to h x w pixels.
+
+    Arrays have the shape [h, w] if no other shape is given.
 
     Attributes:
         inverse: Measured inverse depth, float32, 1 / m; 0 where unknown.
@@ -79,7 +82,7 @@ class DepthFeatures:
         rays: Viewing rays in the camera frame with z = 1, [h, w, 3] float32.
         is_step: True where depth has a step or is unknown, bool.
         surfaces: Number of the smooth surface of each pixel, int32; 0 on edges.
-        sizes: Size of each surface, by number, [S], pixels; 0 for the edges.
+        sizes: Size of each surface in pixels, [S], indexed by its number; sizes[0] (edges) is 0.
     """
 
     inverse: np.ndarray
@@ -97,7 +100,7 @@ class Planes:
 
     Attributes:
         number: Number of the plane of each pixel, [h, w] int32, from 1; 0 without a plane.
-        inverses: For each plane, its inverse depth if it filled the whole image, [h, w] float32,
+        inverses: Inverse depth of each plane, extended over the whole image, [h, w] float32,
             1 / m. Plane 1 comes first.
     """
 
@@ -184,7 +187,7 @@ def structural_planes(seen: DepthFeatures, found: Planes, config: PlaneConfig) -
 
 
 def disc(radius_px: int) -> np.ndarray:
-    """Return a disc as a kernel for morphology, [2 r + 1, 2 r + 1] uint8."""
+    """Return a disc of radius r as a kernel for morphology, [2 r + 1, 2 r + 1] uint8."""
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius_px + 1, 2 * radius_px + 1))
 
 

@@ -42,7 +42,7 @@ def with_box(votes: Votes, name: str, sure: float, most: float) -> Votes:
     could outweigh a result of the labeller. The vote is the square of the score, cut at the limit.
 
     Args:
-        votes: Votes before: tuples (label, sum of its votes, highest confidence of a vote).
+        votes: Earlier votes: tuples (label, sum of its votes, highest confidence of a vote).
         name: Label of the box; if empty, nothing is added.
         sure: Score of the box, 0..1.
         most: Maximum sum of the votes for the label; at a larger sum, the box adds nothing.
@@ -71,10 +71,11 @@ def with_votes_of(votes: Votes, others: Votes, share: float) -> Votes:
 
 
 def winning_label(votes: Votes, least: float) -> tuple[str, float]:
-    """Return the label with the most votes, and its confidence.
+    """Return the label with the largest sum of votes, and its confidence.
 
-    The confidence is the highest confidence of a vote for this label, times the label's fraction of
-    all votes. The result is ("", 0) if the label has fewer than `least` votes.
+    Each entry of `votes` has a label, the sum of its votes, and the highest confidence of one of
+    these votes. A vote may be a fraction. The returned confidence is this highest confidence times
+    the label's fraction of all votes. The result is ("", 0) if the sum is below `least`.
 
     >>> winning_label((("tv", 0.6, 0.5), ("oven", 0.4, 0.6)), 0.35)
     ('tv', 0.3)
@@ -154,8 +155,8 @@ class Region:
         id: Id of the region.
         keyframe: Keyframe of the newest observation.
         box_px: Box of the newest observation, x0 y0 x1 y1, pixels.
-        shape: Observation that later observations are compared with: the observation in the first
-            label request or, before any request, the largest observation.
+        shape: Observation with which later observations are compared. Before the first label
+            request, this is the largest observation; later, it is the observation in that request.
         seen: Number of keyframes that observed the region.
         best: Observation with the best view; None without a view.
         views: Best views, the best first.
@@ -275,12 +276,12 @@ def _spread(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
 
 
 def merge_observation(region: Region, seen: RegionObservation, max_box_votes: float) -> Region:
-    """Return a region with an observation added, but without a new view.
+    """Return a region with an observation added; the views of the region do not change.
 
     Args:
         region: The region.
         seen: The observation.
-        max_box_votes: Maximum sum of votes to which boxes can raise a label, see `with_box`.
+        max_box_votes: Maximum vote sum of a label that boxes alone can reach, see `with_box`.
     """
     proposal = seen.candidate
     surer = max(region, proposal, key=lambda one: one.score)

@@ -128,8 +128,8 @@ def pixels(
     """Project points [P, 3] in the camera frame, meters, to pixels of an image of this shape.
 
     Returns:
-        Rows, [P] int64, columns, [P] int64, and which points lie in the image, [P] bool. Rows and
-        columns are 0 for points outside of the image.
+        The row of each point, [P] int64; the column of each point, [P] int64; and True for each
+        point in the image, [P] bool. Row and column are 0 for points outside of the image.
     """
     z = p_camera[:, 2]
     far = np.maximum(z, 1e-6)
@@ -141,7 +141,7 @@ def pixels(
 
 
 def is_in(part: Foreground, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return which of the pixels with these rows [P] and columns [P] lie in a mask, [P] bool."""
+    """Return whether each of P pixels, given by row and column, lies in a mask, [P] bool."""
     height, width = part.mask.shape
     r, c = rows - part.row, columns - part.column
     inside = (r >= 0) & (c >= 0) & (r < height) & (c < width)
@@ -239,7 +239,7 @@ def _enlarged(rows: np.ndarray, columns: np.ndarray, shape: tuple[int, ...]) -> 
 
 
 class RegionMatcher:
-    """Matching of known regions with the regions of the keyframe that the constructor receives."""
+    """Matcher of known regions with the regions of one keyframe."""
 
     def __init__(
         self,
@@ -303,7 +303,7 @@ class RegionMatcher:
                 yield region.id
 
     def overlaps(self, shown: Sequence[tuple[int, Foreground]]) -> np.ndarray:
-        """Estimate the IoU of each pair of M regions' masks in the matcher's keyframe.
+        """Estimate the IoU of the masks of each pair of M regions in the matcher's keyframe.
 
         The IoU of regions a and b is estimated from two fractions: the fraction of a's points in
         the mask of b, and the fraction of b's points in the mask of a.
@@ -312,8 +312,8 @@ class RegionMatcher:
             shown: Ids of M regions, each once, and their masks in the keyframe.
 
         Returns:
-            The IoU, [M, M], with 1 on the diagonal. A region with too few visible points has 0 with
-            all other regions.
+            The IoU, [M, M], with 1 on the diagonal. If a region has too few visible points, its IoU
+            with all other regions is 0.
         """
         places = {region.id: i for i, region in enumerate(self._regions)}
         inside = np.zeros((len(shown), len(shown)))

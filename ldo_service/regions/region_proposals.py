@@ -71,10 +71,10 @@ class RegionProposalConfig:
                     "max_share",
                     "min_fill",
                 )
-                + ": each must be in [0, 1]."
+                + ": these settings must be in [0, 1]."
             )
         if min(self.min_side_px, self.most) < 1:
-            raise ConfigError(named(self, "min_side_px", "most") + ": each must be at least 1.")
+            raise ConfigError(named(self, "min_side_px", "most") + ": both must be at least 1.")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -86,7 +86,7 @@ class RegionProposal:
         part: Mask of the region.
         label: Label of the detector's box; empty without a box.
         score: Score of the detector's box, 0..1; 0 without a box.
-        number: Number of the detector's box in the keyframe; None without a box.
+        number: Index of the detector's box in the keyframe; None without a box.
         kind: Kind of the segment, see `geometric_segmentation`; empty if the region is the
             foreground of a box.
     """
@@ -217,8 +217,8 @@ def labeled_regions(
 ) -> list[RegionProposal]:
     """Return the regions in `found` that have a reliable label in the map and match no box.
 
-    Regions of the kind `standing`, such as a cup on a table, are excluded: they are proposed even
-    if the map has a label there.
+    The labeller need not label these regions again. Regions of the kind `standing`, such as a cup
+    on a table, are never among them, because the label in the map may be that of the table.
 
     Args:
         boxes_px: Boxes of the detector, [M, 4], x0 y0 x1 y1, pixels.
@@ -240,8 +240,8 @@ def regions_of_image(
 ) -> list[RegionProposal]:
     """Return the segments of an image that a labeller could recognize, without near duplicates.
 
-    A segment of the kind `standing`, such as a cup, lies inside one of the kind `apart`, such as
-    the table below it. The pixels of the cup are then removed from the mask of the table.
+    A segment of the kind `standing` lies inside a segment of the kind `apart`: for example, a cup
+    and the table below it. The pixels of the cup are removed from the mask of the table.
 
     Args:
         found: Segments of the image, see `geometric_segmentation`.
@@ -270,7 +270,7 @@ def _without(one: RegionProposal, others: np.ndarray) -> RegionProposal:
 def distinct_boxes(
     boxes_px: np.ndarray, scores: np.ndarray, config: RegionProposalConfig
 ) -> list[int]:
-    """Return the numbers of the boxes that show different objects.
+    """Return the indices of the boxes that show different objects.
 
     Of several boxes that show the same object, the one with the highest score is returned. Two
     boxes show the same object if their IoU exceeds `same_iou`.

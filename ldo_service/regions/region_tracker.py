@@ -7,8 +7,8 @@ boxes and from label results. The label of the region is the label with the most
 
 An object may be segmented differently in each keyframe, so several regions may show the same
 object. To decide the label of a region, the votes of overlapping labelled regions are therefore
-added, weighted by the overlap. If an object stands on another one, the votes of their regions are
-not added.
+added, weighted by the overlap. If an object stands on another one, the votes of the regions of the
+two objects are not added to each other.
 
 The tracker requests a label for a region when several keyframes in a row show no better view. The
 request contains the best views. Most regions show only parts or shadows of objects. The number of
@@ -84,8 +84,8 @@ class RegionTracker:
             camera: Intrinsics of both images.
             T_map_keyframe: Current poses of this keyframe and of the keyframes with earlier
                 observations, [4, 4], by id.
-            named: Regions that have a reliable label in the map. They are observations of known
-                labelled regions and create no region or label request.
+            named: Regions that have a reliable label in the map. They are only matched with known
+                labelled regions; they create no new region and no label request.
 
         Returns:
             New label requests, and the labels of the keyframe's regions.
@@ -177,7 +177,7 @@ class RegionTracker:
         return region_labels
 
     def shown_in(self, region: int) -> tuple[int, ...]:
-        """Return the keyframes of the views that a label request for a region contains.
+        """Return the keyframes from which the tracker has a view of a region.
 
         The result is empty if the region was dropped.
         """
@@ -197,7 +197,7 @@ class RegionTracker:
         Args:
             region: Id of the region.
             keyframe: Id of the earlier keyframe.
-            depth_m: Its depth, [H, W], meters; 0 where unknown.
+            depth_m: Depth of that keyframe, [H, W], meters; 0 where unknown.
             camera: Intrinsics of all keyframes.
             T_map_keyframe: Current poses of all keyframes, [4, 4], by id.
 

@@ -13,8 +13,8 @@ MAX_VIEWS = 8  # Maximum views in a label request.
 class RegionTrackerConfig:
     """Settings of the region tracks.
 
-    A region track is an image region that is followed over keyframes. A view of it is the crop of
-    one keyframe around it; a label request sends the best views to the labeller.
+    A region track is an image region that is followed over keyframes. A view is a crop of one
+    keyframe around the region. A label request sends the best views to the labeller.
     """
 
     views: int = 5  # Maximum views in a label request, the best ones.
@@ -77,22 +77,22 @@ class RegionTrackerConfig:
                     "max_propagated",
                     "most",
                 )
-                + ": each must be at least 1."
+                + ": these settings must be at least 1."
             )
         if self.patience < 0 or self.per_keyframe <= 0:
             raise ConfigError(
                 named(self, "patience", "per_keyframe")
-                + ": patience must be at least 0, per_keyframe positive."
+                + ": patience must be at least 0, and per_keyframe must be positive."
             )
         if not (0 <= self.min_quality <= 1 and 0 <= self.min_propagation_confidence <= 1):
             raise ConfigError(
                 named(self, "min_propagation_confidence", "min_quality")
-                + ": both must be in [0, 1]."
+                + ": both settings must be in [0, 1]."
             )
         if self.views_first > self.views or not self.gain > 1:
             raise ConfigError(
                 named(self, "views", "views_first", "gain")
-                + ": views_first must be at most views, gain above 1."
+                + ": views_first must be at most views, and gain must be above 1."
             )
         if self.views > MAX_VIEWS:
             raise ConfigError(
@@ -102,15 +102,15 @@ class RegionTrackerConfig:
         if not (0 < self.overlap <= 1 and self.max_gap_m > 0 and self.min_points >= 1):
             raise ConfigError(
                 named(self, "overlap", "max_gap_m", "min_points")
-                + ": overlap must be in (0, 1], max_gap_m positive, min_points at least 1."
+                + ": overlap must be in (0, 1], max_gap_m above 0, and min_points at least 1."
             )
         if not (self.answer_weight > 0 and self.min_votes >= 0):
             raise ConfigError(
                 named(self, "answer_weight", "min_votes")
-                + ": answer_weight must be positive, min_votes not negative."
+                + ": answer_weight must be positive, and min_votes must be at least 0."
             )
 
     @property
     def max_box_votes(self) -> float:
-        """Maximum sum of votes to which boxes can raise a label; 0 if boxes do not vote."""
+        """Maximum vote sum of a label that boxes alone can reach; 0 if boxes do not vote."""
         return self.answer_weight if self.boxes_vote else 0.0

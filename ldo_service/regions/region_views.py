@@ -33,7 +33,7 @@ class ViewConfig:
                 + ": context must be at least 0, and the other settings must be positive."
             )
         if not 0 <= self.min_factor <= 1:
-            raise ConfigError(named(self, "min_factor") + ": must be in [0, 1].")
+            raise ConfigError(named(self, "min_factor") + ": the factor must be in [0, 1].")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -141,7 +141,7 @@ def facing_factor(
     """Return the quality factor for how directly the camera faces the surface of a region.
 
     The factor is `min_factor + (1 - min_factor) c`, where c is the mean cosine between the normals
-    of the region and the viewing rays. It is `min_factor` if no normal is known.
+    of the region and the viewing rays. If no normal is known, the factor is `min_factor`.
 
     Args:
         depth_m: Depth, [H, W], meters; 0 where unknown.

@@ -1,1 +1,1 @@
-"""Runs over a sequence of frames, whose results are written to a folder."""
+"""Runs over sequences of frames, each with a folder for its results."""

@@ -23,8 +23,8 @@ LAST_RATE = 0.05
 class ActorRun:
     """Actors of a run and the record of their outputs, used as a context manager.
 
-    `LogicalClock` explains why the results do not depend on the load of the machine. The threads of
-    the actors end with the context; the record stays.
+    The module `runtime.logical_clock` explains why the results do not depend on the load of the
+    machine. The threads of the actors end at the end of the context; the record can still be used.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class ActorRun:
         return self._clock.tick(item)
 
     def run(self, source: Iterable[Message | tuple[Message, ...]]) -> Iterator[int]:
-        """Deliver each item of a source in a tick of its own, and then finish.
+        """Deliver each item of a source in a tick of its own, and then call `finish`.
 
         Yields:
             The number of each tick.
@@ -80,12 +80,12 @@ class ActorRun:
         self.keep_step_times()
 
     def keep_step_times(self) -> None:
-        """Store the step times so far for the summary, which then excludes a later refinement."""
+        """Store the step times so far, so that the summary excludes a later refinement."""
         self._stage_ms = self._step_percentiles()
 
     @property
     def pending_iterations(self) -> int:
-        """Iterations that refit the map to keyframes which corrections have moved."""
+        """Number of pending iterations that refit the map to keyframes moved by corrections."""
         return int(self.actors["mapper"].metrics()["iterations_pending"])
 
     def summary(
@@ -95,9 +95,9 @@ class ActorRun:
 
         Args:
             frames: Number of frames.
-            rejected: Number of frames that could not be used. Frames that the actor frame_source
-                rejected are not included.
-            used: Time that the frames took.
+            rejected: Number of frames that could not be used, not counting those that the actor
+                frame_source rejected. The summary adds the latter.
+            used: Elapsed time and CPU time that the frames took.
             is_finished: False if the run was interrupted.
         """
         metrics = {name: actor.metrics() for name, actor in self.actors.items()}

@@ -1,4 +1,4 @@
-"""Writer of the keyframe database of a run, in which `--localize` finds the camera."""
+"""Writer of a run's keyframe database, with which `--localize` later finds the camera."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +34,7 @@ class DatabaseWriter:
         self._database = self._database.with_record(record, config.keyframe_database)
 
     def save(self, path: Path, poses: KeyframePoses, merged: dict[int, int]) -> None:
-        """Write the records of all keyframes in the frame of the map.
+        """Write the records of the keyframes that have a pose in the map.
 
         Args:
             path: File to write.

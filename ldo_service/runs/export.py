@@ -59,24 +59,25 @@ def export_map(
     """Write the map or the trajectory to a file.
 
     Args:
-        source: The map.
+        source: Folder with the map and the trajectory.
         format: Format of the file.
         out: File to write. `occupancy` also writes a floor plan beside it.
         run: Folder of the run, whose outputs are never replaced.
-        voxel_m: Side of a voxel of mesh and occupancy, meters; None for the default.
+        voxel_m: Side of a voxel for the formats mesh and occupancy, meters; None for the default.
         up: Axis of the map that points up, for the floor plan of occupancy.
         heights_m: Lowest and highest height of the voxels in the floor plan of occupancy, meters
             above the first camera.
-        overwrite: True replaces an earlier file.
-        threads: Threads of mesh and occupancy; None for all cores.
-        advance: Function that receives the progress of mesh and occupancy.
+        overwrite: True to replace an existing file.
+        threads: Number of threads for mesh and occupancy; None for all cores.
+        advance: Function that receives the number of finished keyframes and the number of all
+            keyframes, for mesh and occupancy.
 
     Returns:
         A short description of what was written.
 
     Raises:
-        ConfigError: An option does not fit the format, or the file exists, is an output of the run,
-            or cannot be written.
+        ConfigError: An option does not fit the format, the file exists or is an output of the run,
+            or the file cannot be written.
         DataError: The map cannot be read, or has no surface.
     """
     if format not in WRITERS:
@@ -86,13 +87,13 @@ def export_map(
     if voxel_m is not None and format not in ("mesh", "occupancy"):
         raise ConfigError(
             f"a voxel size (--voxel) applies to the formats mesh and occupancy, not to {format}. "
-            "Remove it."
+            "Remove the voxel size."
         )
     written = [out.with_suffix(Path(name).suffix) for name in EXPORTED[format][1:]]
     if out in written:
         raise ConfigError(
-            f"the floor plan, which is written next to the grid, would replace {out}. Choose a "
-            f"file named {out.with_suffix(Path(EXPORTED[format][0]).suffix).name}."
+            f"the occupancy grid cannot have the name {out}, because its floor plan is written to "
+            f"this file. Use the name {out.with_suffix(Path(EXPORTED[format][0]).suffix).name}."
         )
     require_writable((run, source.folder), [out, *written], overwrite)
     try:
@@ -110,7 +111,7 @@ def require_writable(runs: Iterable[Path], files: list[Path], overwrite: bool) -
     Args:
         runs: Folders of runs.
         files: Files to write.
-        overwrite: True if existing files may be replaced; outputs of a run never may.
+        overwrite: True if existing files may be replaced; outputs of a run are never replaced.
 
     Raises:
         ConfigError: If a file exists already, or is an output of a run.

@@ -44,14 +44,15 @@ class FinalPoses:
 
     Each frame was aligned to a reference keyframe r. Consider r and the keyframes that were aligned
     to r. Keyframe a is the last of these that is not later than the frame, and keyframe b is the
-    first one that is later. T_r_a and T_r_b were measured during the run; T_map_a and T_map_b are
-    final poses. Both keyframes give a pose of the camera:
+    first one that is later. T_r_camera, T_r_a and T_r_b are the poses of the frame, of a and of b
+    in r, measured during the run. T_map_a and T_map_b are final poses. Both keyframes give a pose
+    of the camera:
 
         T_a = T_map_a T_r_a^-1 T_r_camera,    T_b = T_map_b T_r_b^-1 T_r_camera.
 
     Both poses are equal if no correction has moved a relative to b. Otherwise the result is
-    interpolated between T_a and T_b by the stamps of a, the frame and b. If there is no b, the
-    result is T_a.
+    interpolated between T_a and T_b, by the time of the frame between a and b. If there is no b,
+    the result is T_a.
     """
 
     def __init__(self) -> None:
@@ -75,7 +76,7 @@ class FinalPoses:
 
         Args:
             frames: The frames.
-            T_map: Final pose T_map_keyframe of each keyframe, [4, 4].
+            T_map: Final pose T_map_keyframe of each keyframe, [4, 4], by id.
 
         Returns:
             T_map_camera, [N, 4, 4]. A frame without a known reference keyframe keeps the pose that

@@ -1,6 +1,7 @@
-"""Reading of the folder of a finished run. The module `runs.folder` lists its files.
+"""Functions that read the folder of a finished run.
 
-A function raises DataError if a file that it needs is missing or has an invalid format.
+The module `runs.folder` lists the files of the folder. A function raises DataError if a file that
+it needs is missing or has an invalid format.
 """
 
 import csv
@@ -59,7 +60,7 @@ def vlm_calls(folder: Path) -> int | None:
 
 
 def newest_map(folder: Path) -> "MapFolder":
-    """Return the refined map of a run if there is one, else the map at the end of the stream."""
+    """Return the refined map of a run if there is one, else the map before refinement."""
     return MapFolder(folder / REFINED if has_refined(folder) else folder)
 
 
@@ -123,7 +124,7 @@ class MapFolder:
         return list(read_viewpoints(self.folder).values())
 
     def exposures(self) -> Exposures:
-        """Return the exposures of the keyframes; empty if an older version wrote the run."""
+        """Return the exposures of the keyframes; empty if an older LDO-SLAM wrote the run."""
         with _keyframes(self.folder) as (_, keyframes):
             exposed = [keyframe for keyframe in keyframes if "exposure" in keyframe]
             stamps_ns = np.array([int(keyframe["stamp_ns"]) for keyframe in exposed], np.int64)
@@ -191,8 +192,8 @@ def _keyframes(folder: Path) -> Iterator[tuple[Path, list[dict[str, Any]]]]:
 def _viewpoint(path: Path, keyframe: dict[str, Any]) -> Viewpoint:
     if "camera" not in keyframe:
         raise DataError(
-            f"{path} has no camera for its keyframes, because an older version wrote it. Run "
-            "`ldo run` on the sequence again."
+            f"{path} has no cameras of the keyframes, because an older version of LDO-SLAM wrote "
+            "it. Run `ldo run` on the sequence again."
         )
     T_map_camera = np.array(keyframe["T_map_camera"], float)
     if T_map_camera.shape != (4, 4) or not np.all(np.isfinite(T_map_camera)):

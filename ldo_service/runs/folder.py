@@ -1,16 +1,17 @@
 """Folder that a run writes.
 
-trajectory_online.txt      poses of the first submap as published; LOST frames are omitted
+trajectory_online.txt      poses of the first submap as published during the run; LOST frames are
+                           omitted
 trajectory.txt             poses of the first submap and of those merged with it, after the last
                            correction; LOST frames are omitted
 frames.csv                 status, residuals, tracking time (ms) and submap of every frame
 keyframes.json             id, frame, stamp, camera and pose of every keyframe
-map.ply                    Gaussians anchored to keyframes in the frame of the map
-semantics.npz              labels of these Gaussians: `semantics.semantics_file`
-objects.json               objects in the map: `runs.records`
+map.ply                    Gaussians whose anchor keyframe has a pose in the map
+semantics.npz              labels of these Gaussians; format: `semantics.semantics_file`
+objects.json               objects in the map; format: `runs.records`
 keyframe_database.msgpack  database for `--localize`, with the final poses
-loops.json                 loop candidates with their rejection reasons: `runs.records`
-front_end.mcap             recorded outputs of tracker and detector: `runs.front_end`
+loops.json                 loop candidates with their rejection reasons; format: `runs.records`
+front_end.mcap             recorded outputs of tracker and detector; format: `runs.front_end`
 config.yaml                effective configuration
 summary.json               counts, speed, memory, versions
 refined/                   trajectory, keyframes and map after further iterations
@@ -140,7 +141,7 @@ def prepare(folder: Path, overwrite: bool) -> None:
 
 
 class RunWriter:
-    """Record of the outputs of a run's actors, and writer of its folder.
+    """Record of the outputs of a run's actors, and writer of the run's folder.
 
     If the constructor gets a folder, it writes config.yaml there, and `observe` writes frames.csv
     during the run. `save` writes all files, with or without such a folder.
@@ -343,7 +344,7 @@ class RunWriter:
         ]
 
     def placed_objects(self) -> MapObjects | None:
-        """Return the objects whose first observing keyframe has a pose in the map.
+        """Return the objects that were first observed by a keyframe with a pose in the map.
 
         The result is None if no detector ran.
         """

@@ -158,7 +158,7 @@ class FrontEnd:
             raise DataError(
                 f"{path} has {kept[2]} frames of {kept[0]} with stride {kept[1]}; this run has "
                 f"{ours[2]} of {ours[0]} with stride {ours[1]}. Source, stamps, --stride and "
-                "--max-frames must be the same."
+                "--max-frames must be the same as in the recorded run."
             )
         return cls(frames - len(stamps_ns), index)
 
@@ -213,12 +213,12 @@ def _require_settings(path: Path, about: Mapping[str, str], config: Config) -> N
         made_by, ours = about.get("ldo", "an unknown version"), versions()["ldo-slam"]
         raise DataError(
             f"{path} was recorded by LDO-SLAM {made_by}, whose settings differ from those of "
-            f"this version, {ours}. Repeat that run."
+            f"this version, {ours}. Repeat the recorded run with this version."
         )
     for name, value in configured.items():
         if was[name] != value:
             raise ConfigError(
-                f"{name}={value} was {was[name]} when {path} was recorded. With "
-                "--reuse-front-end it must be the same, since the front end does not run again. "
-                "Set the recorded value, or remove --reuse-front-end."
+                f"{name}={value} must be {was[name]}, the value of the run that recorded {path}. "
+                "With --reuse-front-end, the front end does not run again. Set the recorded value, "
+                "or remove --reuse-front-end."
             )

@@ -19,10 +19,13 @@ REFINE_ITERATIONS = 25  # Maximum iterations per refinement request, which takes
 class Advance(Protocol):
     """Callback that reports progress.
 
+    The progress counts frames and refinement requests. A refinement request asks the mapper for up
+    to `REFINE_ITERATIONS` iterations of the Gaussian optimizer.
+
     Args:
         done: Number of finished frames and refinement requests.
-        total: Number of all frames and refinement requests; None if it has not changed since the
-            last call. The number grows if corrections of the pose graph require a refit.
+        total: Number of frames and refinement requests of the whole run. It grows if corrections
+            of the pose graph require a refit. None: the number is the same as in the last call.
     """
 
     def __call__(self, done: int, total: int | None = None, /) -> None: ...
@@ -43,7 +46,7 @@ class RunOptions:
             is no other odometry.
         front_end: Recorded outputs that replace frame source, tracker and detector; None to run
             these actors.
-        keep_front_end: True to record the front end of this run.
+        keep_front_end: True to record the outputs of frame source, tracker and detector.
     """
 
     sequence: Sequence
@@ -64,23 +67,27 @@ class RunOptions:
 
     @property
     def work(self) -> int:
-        """Total of the progress: number of selected frames plus number of refinement requests."""
+        """Total for progress reports: number of selected frames plus refinement requests."""
         return len(self.selection.indices(self.sequence)) + requests(self.refine)
 
 
 def requests(iterations: int) -> int:
-    """Return the number of refinement requests into which `iterations` are divided."""
+    """Return the number of refinement requests that `iterations` iterations need.
+
+    Each request asks the mapper for at most `REFINE_ITERATIONS` iterations.
+    """
     return -(-iterations // REFINE_ITERATIONS)
 
 
 def require_held_out(stride: int, hold_out: int) -> None:
-    """Check that the run reads the frames that are held out.
+    """Check that the stride does not skip all held-out frames.
 
-    Every `hold_out`-th frame of the whole sequence is held out, including frames that the stride
-    skips. If both numbers have a common factor, the stride skips all held-out frames.
+    Held-out frames are tracked but not mapped. Every `hold_out`-th frame of the whole sequence is
+    held out, including frames that the stride skips. If `stride` and `hold_out` have a common
+    factor above 1, the stride skips all held-out frames.
 
     Raises:
-        ConfigError: If both numbers have a common factor.
+        ConfigError: `stride` and `hold_out` have a common factor above 1.
     """
     if hold_out and gcd(stride, hold_out) > 1:
         raise ConfigError(

@@ -47,7 +47,7 @@ STAGES = ("first rendering", "densification", "iterations", "view", "other")
 class HeldOutErrors(msgspec.Struct, frozen=True, kw_only=True):
     """Errors on the held-out frames before the last keyframe.
 
-    PSNR is that of protocol A in `ldo_service.evaluation.views.PROTOCOL`.
+    The PSNR follows protocol A, which `ldo_service.evaluation.views.PROTOCOL` describes.
     """
 
     mean_psnr_db: float
@@ -75,8 +75,8 @@ class MapMeasurement(msgspec.Struct, frozen=True, kw_only=True):
 class TimedMapBuilder(MapBuilder):
     """Map builder that adds up the time of each stage, on one thread.
 
-    On a GPU, it measures wall time, because the host waits for the GPU at the end of a plan.
-    Otherwise, it measures CPU time.
+    On a CPU, it measures CPU time. On a GPU, it measures wall time. Wall time includes the work of
+    the GPU, because the host waits for the GPU at the end of each series of iterations.
 
     Attributes:
         times_s: Time by stage, seconds.
@@ -114,13 +114,16 @@ class TimedMapBuilder(MapBuilder):
 
 
 def require_device(builder: MapBuilder) -> None:
-    """Check that the CPU has not replaced a GPU during a measurement.
+    """Check that the map builder has not fallen back from a GPU to the CPU.
 
     Raises:
         DeviceError: The GPU is missing or has failed.
     """
     if builder.fitting.device.has_failed:
-        raise DeviceError(f"the measurement is void: {builder.fitting.device.reason}")
+        raise DeviceError(
+            "the measurement is void, because the mapper used the CPU instead of the GPU: "
+            f"{builder.fitting.device.reason}"
+        )
 
 
 @dataclass(frozen=True, slots=True)

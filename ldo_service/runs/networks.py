@@ -8,7 +8,8 @@ from ldo_service.config import Config, actor_parameters
 def require_usable_networks(config: Config) -> None:
     """Check that the configured networks can be used.
 
-    The live service does not call this function: it only warns about a network that it cannot use.
+    The live service does not call this function. Instead, the service only warns if it cannot use
+    a network.
 
     Raises:
         ConfigError: A network cannot be used.

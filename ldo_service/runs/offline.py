@@ -19,8 +19,8 @@ def run_offline(job: RunOptions, advance: Advance) -> RunWriter:
 
     After the last frame, the map is refitted to keyframes that corrections have moved. It is then
     refined if `job.refine` is not 0. The result does not depend on the load of the machine; see
-    `runtime.logical_clock`. An interrupted or failed run leaves partial results, which its summary
-    marks as interrupted.
+    `runtime.logical_clock`. An interrupted or failed run leaves partial results, and the summary
+    marks the run as interrupted.
 
     Args:
         job: Options of the run.
@@ -67,7 +67,10 @@ class OfflineRun:
         self._actors.__exit__(*error)
 
     def stream(self) -> None:
-        """Process every selected frame, and record the front end if `keep_front_end` is set."""
+        """Process every selected frame.
+
+        If `keep_front_end` is set, record the outputs of frame source, tracker and detector.
+        """
         job = self._job
         frames = interleave_prior(self._reader, job.prior)
         with ExitStack() as kept:
@@ -79,7 +82,7 @@ class OfflineRun:
         self._actors.keep_step_times()
 
     def repair(self) -> None:
-        """Run the pending refit iterations for keyframes that corrections have moved."""
+        """Refit the map to keyframes that corrections of the pose graph have moved."""
         if due := self._actors.pending_iterations:
             self._work += requests(due)
             self._run(refinements(due, self.record.newest_stamp_ns))
@@ -98,7 +101,7 @@ class OfflineRun:
         self.record.close(summary)
 
     def refine(self) -> None:
-        """Run the requested refinement and write its results to their own folder."""
+        """Refine the map by `RunOptions.refine` iterations, and write it to a folder of its own."""
         self._run(refinements(self._job.refine, self.record.newest_stamp_ns))
         self.record.write_refined(self._job.refine)
 
@@ -126,7 +129,7 @@ def require_usable(record: RunWriter, max_rejected: float) -> None:
         max_rejected: Maximum fraction of rejected frames.
 
     Raises:
-        DataError: A larger fraction of frames was rejected.
+        DataError: The fraction of rejected frames exceeds `max_rejected`.
     """
     frames, rejected = record.summary["frames"], record.summary["frames_rejected"]
     if rejected > max_rejected * frames:

@@ -1,4 +1,4 @@
-"""Frames of a recording of `ldo record` as a sequence."""
+"""Sequence of the camera frames in a recording that `ldo record` has made."""
 
 from collections.abc import Iterator
 from contextlib import suppress
@@ -96,8 +96,9 @@ class RecordingSequence(Sequence):
                 self._frames.append(frame)
         if not self._frames:
             raise DataError(
-                f"{folder} holds no {CAMERA_RGBD.name}, nor pairs of {CAMERA_COLOR.name} and "
-                f"{CAMERA_DEPTH.name}. Check that frame_source was recorded."
+                f"{folder} holds no {CAMERA_RGBD.name} messages, and no pairs of "
+                f"{CAMERA_COLOR.name} and {CAMERA_DEPTH.name} messages. Check that the actor "
+                "frame_source was recorded."
             )
         stamps_ns = np.array([frame.color.stamp_ns for frame in self._frames], np.int64)
         super().__init__(name_of(folder), self._camera(folder), stamps_ns)

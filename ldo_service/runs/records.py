@@ -8,8 +8,8 @@ closures     fields of `loop/closure`: keyframe, reference, T_reference_keyframe
              [6, 6], overlap, rmse_m, entropy; is_believed is true if the pose graph accepted the
              closure and kept it until the end
 
-objects.json has the objects of the map, in its frame. It is the message `map/objects` as JSON,
-whose `objects` is a list of
+objects.json has the objects of the map, in the map frame. The file is the message `map/objects` as
+JSON. Its field `objects` is a list of entries with these fields:
 
     id                        constant during a run
     name, confidence          most probable class except background, and its probability
@@ -59,7 +59,7 @@ class LoopRecord:
         """Record one message.
 
         Args:
-            message: Output of the loop closer or the optimizer.
+            message: Output of the loop closer or the pose-graph optimizer.
             step_ms: Duration of the step that produced the message, milliseconds.
         """
         match message:

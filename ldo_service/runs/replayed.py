@@ -69,7 +69,7 @@ class RecordedActor:
         return make(actor_parameters(replace(config, mapper=mapper)))
 
     def caveats(self) -> list[str]:
-        """Return reasons why results may differ in the last bits on this machine."""
+        """Return the reasons why a replay on this machine may differ from the recording."""
         return [line for file in self.files[:1] for line in _caveats(file.about)]
 
 
@@ -160,8 +160,8 @@ def open_recording(folder: Path, only: tuple[str, ...] = ()) -> list[RecordedAct
         only: Names of actors to return; empty returns all.
 
     Raises:
-        DataError: The folder has no recording, the recording has no steps, or it has another
-            recording version.
+        DataError: The folder has no recording, the recording has no steps, or this service cannot
+            replay the version of the recording.
         ConfigError: An actor is not in the recording.
     """
     found = recorded_actors(folder)
@@ -183,6 +183,6 @@ def open_recording(folder: Path, only: tuple[str, ...] = ()) -> list[RecordedAct
     if not any(actor.steps for actor in actors):
         names = ", ".join(only) or "any actor"
         raise DataError(
-            f"{folder} has no recorded step of {names}. Make a new recording with camera frames."
+            f"{folder} has no recorded step of {names}. Record again while camera frames arrive."
         )
     return actors

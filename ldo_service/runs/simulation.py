@@ -54,7 +54,7 @@ def simulate_graph(
 ) -> dict[str, ActorDigest]:
     """Run all actors over the selected frames and return the digest of the outputs of each actor.
 
-    The digests do not depend on the load of the machine or on the number of threads, see
+    The digests do not depend on the load of the machine or on the number of threads; see
     `runtime.logical_clock`.
 
     Raises:

@@ -50,7 +50,7 @@ class Selection:
 
 
 class FrameReader:
-    """Reader of frames as camera messages.
+    """Reader that yields the selected frames of a sequence as camera messages.
 
     A thread reads frames in advance. Frames that cannot be read are skipped and counted.
     """
@@ -85,7 +85,7 @@ class FrameReader:
 def recorded_prior(
     sequence: Sequence, indices: range, config: Config, warn: Warn
 ) -> Trajectory | None:
-    """Return the odometry that was recorded with a sequence as poses T_odom_base, or None.
+    """Return the recorded odometry of a sequence: poses T_odom_base, or None.
 
     The result is None if the sequence has no odometry at the time of the selected frames. The user
     is then warned.
@@ -118,10 +118,10 @@ def T_base_camera(config: Config) -> np.ndarray:
 def interleave_prior(
     frames: Iterable[CameraRgbd], prior: Trajectory | None
 ) -> Iterator[tuple[Message, ...]]:
-    """Yield each frame after the poses of the odometry prior that its tracking needs.
+    """Yield each frame, preceded by the poses of the odometry prior that its tracking needs.
 
-    These are all remaining poses whose stamps are before the frame, and the first one at or after
-    it. The pose at the stamp of the frame can then be interpolated.
+    A frame needs all remaining poses with earlier stamps, and the first pose whose stamp is not
+    earlier. The tracker can then interpolate the pose at the stamp of the frame.
 
     Args:
         frames: The frames.
@@ -145,7 +145,7 @@ class PriorSource:
         self._last_ns = -1
 
     def until(self, stamp_ns: int) -> list[OdometryPrior]:
-        """Return the remaining poses up to and including the first one not older than a stamp."""
+        """Return the remaining poses before a stamp, and the first pose at or after the stamp."""
         news = []
         while self._last_ns < stamp_ns and (pose := next(self._poses, None)) is not None:
             news.append(pose)
@@ -186,10 +186,10 @@ def _times_s(sequence: Sequence, indices: range) -> tuple[float, float]:
 
 
 def layout_of(source: str) -> str:
-    """Return the name of a source's layout, for users; "none" if no layout fits the source.
+    """Return the display name of a source's file layout; "none" if no known layout fits.
 
     Raises:
-        ConfigError: A layout of another package cannot be loaded.
+        ConfigError: A layout that another package provides cannot be loaded.
     """
     path = Path(source).expanduser()
     if source.partition(":")[0] == "synthetic":

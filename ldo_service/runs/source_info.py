@@ -36,7 +36,7 @@ class Timing:
 
 @dataclass(frozen=True, slots=True)
 class DepthInfo:
-    """Depth of a source."""
+    """Properties of the depth images of a source."""
 
     registration: str  # See `Sequence.registration`.
     # Stamp of depth minus stamp of color: median, and largest absolute value; None if unknown.
@@ -49,7 +49,7 @@ class DepthInfo:
 
 @dataclass(frozen=True, slots=True)
 class SourceInfo:
-    """Description of a source."""
+    """Description of a source of frames."""
 
     name: str
     streams: tuple[Stream, ...]  # See `Sequence.streams`.
@@ -65,7 +65,7 @@ class SourceInfo:
 
 
 def describe(sequence: Sequence) -> SourceInfo:
-    """Describe a sequence, after reading SAMPLES of its frames.
+    """Describe a sequence from its metadata and from `SAMPLES` evenly spaced frames.
 
     Raises:
         DataError: The ground truth is invalid.

@@ -67,7 +67,7 @@ def summarize(
         frames: Number of selected frames.
         rejected: Number of frames that could not be used.
         stage_ms: Percentiles of the step durations of each actor.
-        drops: Number of dropped messages, by consumer and topic: "ACTOR TOPIC".
+        drops: Number of dropped messages by consumer and topic; each key is "ACTOR TOPIC".
         metrics: Metrics at the end, by actor.
     """
     names = [name for name in ("tracker", "optimizer", "mapper") if name in metrics]

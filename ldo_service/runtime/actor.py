@@ -120,21 +120,21 @@ class StateFiles(Protocol):
     """Files to which the saved state of an actor refers."""
 
     def saved(self) -> None:
-        """Remove files that the last snapshot, which is saved now, does not need."""
+        """Remove the files that the most recently saved snapshot does not need."""
 
     def kept(self, *, is_previous_complete: bool) -> None:
-        """Remove files that no generation of the state needs any more.
+        """Remove the files that no generation of the state needs.
 
-        The stage calls this method each time it has kept the saved state as a generation; see
-        `runtime.generations`.
+        A generation is a synced copy of the states of all actors, to which the service can fall
+        back. The stage calls this method after each copy; see `runtime.generations`.
 
         Args:
-            is_previous_complete: Whether the generation kept before this one is complete. If it is
-                not, the service may still fall back to an older one, and no file is removed.
+            is_previous_complete: True if the generation before the newest one is complete.
+                Otherwise, no file is removed, because the service may fall back to an older one.
         """
 
     def retired_bytes(self) -> int:
-        """Return the size of the files that only older generations of the state need, bytes."""
+        """Return the size of the files that only older copies of the state need, bytes."""
         ...
 
     def unsynced_files(self) -> list[Path]:
@@ -142,7 +142,7 @@ class StateFiles(Protocol):
         ...
 
     def begin_sync(self) -> None:
-        """Record that the stage now syncs the files that `unsynced_files` returned last."""
+        """Record that the stage starts to sync the files of the last `unsynced_files` call."""
 
     def end_sync(self) -> None:
         """Record that the files of the last `begin_sync` are on the disk."""
@@ -152,7 +152,7 @@ class Actor:
     """Unit of computation that handles messages.
 
     A step is the handling of one message. The stage is the runtime around the actor. Before each
-    step, the stage sets `situation` to the current credits and backlogs.
+    step, the stage sets `situation` to the credits of the outputs and the backlogs of the inputs.
     """
 
     name: ClassVar[str]
@@ -212,7 +212,8 @@ class Actor:
     def on_stop(self) -> Iterator[Message]:
         """Yield the final messages of the actor.
 
-        On a soft stop, the stage calls this method after the actor has handled all queued messages.
+        On a soft stop, the actor first handles all queued messages. Then the stage calls this
+        method.
         The actors stop in the order of `actor_graph.finish_order`. Only messages of ports with
         `is_final` are allowed.
         """

@@ -61,10 +61,10 @@ def check_graph(actors: Iterable[HasPorts]) -> None:
 def finish_order(actors: Iterable[T]) -> list[T]:
     """Return the actors in the order in which they finish, producers first where possible.
 
-    The final messages of an actor may cause new inputs of other actors, directly or through actors
-    in between. For example, the last loop closure causes a correction of the map. An actor with
-    final messages therefore finishes after the actors whose final messages reach it, and after the
-    actors in between. The rule does not apply to two actors whose final messages reach each other.
+    The final messages of an actor may reach other actors, directly or through actors in between.
+    For example, the last loop closure causes a correction of the map. An actor with final messages
+    therefore finishes after two groups: the actors whose final messages reach it, and the actors
+    in between. The rule does not apply to two actors whose final messages reach each other.
 
     Args:
         actors: The actors, producers first.
@@ -88,8 +88,8 @@ def finish_order(actors: Iterable[T]) -> list[T]:
 def consumers_first(actors: Iterable[T]) -> list[T]:
     """Return the actors so that each one comes after the consumers of its lossless topics.
 
-    The order is that of a depth-first search from each actor to its consumers. Of two actors that
-    are consumers of each other, the one that the search visits first comes last.
+    The order is that of a depth-first search from each actor to its consumers. If two actors
+    consume messages of each other, the actor that the search visits first comes after the other.
 
     Args:
         actors: The actors, producers first.

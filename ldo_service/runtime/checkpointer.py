@@ -159,7 +159,7 @@ class Checkpointer:
             )  # fmt: skip
 
     def is_last_kept(self, generation: int) -> bool:
-        """Return whether this generation is the last one that this stage has kept."""
+        """Return whether this stage has kept its state in `generation`, and in no later one."""
         return generation != 0 and generation == self._last_kept
 
     def keep(
@@ -167,14 +167,16 @@ class Checkpointer:
     ) -> tuple[GenerationFiles | None, list[Path]]:
         """Keep the last saved state as a generation; see `runtime.generations`.
 
+        A generation is a synced copy of the states of all actors.
+
         Args:
             actor: The actor.
             generation: Number of the generation.
             completed: Number of the newest generation that all actors have completed.
 
         Returns:
-            The files of the generation, which the caller must write, and the other files and
-            folders, which the caller must sync.
+            Two values: the files of the generation, which the caller must write, and further files
+            and folders, which the caller must sync.
 
         Raises:
             OSError: A file cannot be read.
@@ -212,7 +214,7 @@ class Checkpointer:
     def metrics(self) -> dict[str, float]:
         """Return sizes on disk, and counters of failed saves and damaged states, if any.
 
-        `state_mb` is the size of the actor's state and its older generations.
+        `state_mb` is the size of the actor's state and of its older copies, MB.
         """
         metrics: dict[str, float] = {}
         if isinstance(self._store, FolderStore):

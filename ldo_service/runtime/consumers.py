@@ -1,4 +1,4 @@
-"""State of the lossless consumers of a topic, as its producer knows it."""
+"""State of the lossless consumers of a topic, as known to the producer of the topic."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -41,12 +41,12 @@ class Consumers:
     Consumers in `expected` are required: they must not miss a message. Each consumer has one of two
     policies:
 
-    - `Lossless`: The producer waits until the consumer grants it credit: a number of messages that
-      it may send. While a required consumer is disconnected, the producer has no credit. A consumer
-      that is not required limits the credit only while it is connected.
-    - `Backlog`: The producer never waits for the consumer, and stores its unhandled messages on
-      disk: the backlog. The credit of the consumer only decides how many messages of the backlog
-      the producer sends next.
+    - `Lossless`: The producer waits until the consumer grants credit: the number of messages that
+      the producer may send. While a required consumer is disconnected, the producer has no credit.
+      A consumer that is not required limits the credit only while it is connected.
+    - `Backlog`: The producer never waits for the consumer. The messages that the consumer has not
+      handled are stored on disk: the backlog. The credit of the consumer only decides how many
+      messages of the backlog the producer sends next.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class Consumers:
         """Return the offset of the first message that at least one consumer has not handled.
 
         Args:
-            seq: Offset of the producer's next message, which is the result without consumers.
+            seq: Offset of the producer's next message. It is the result if there are no consumers.
         """
         return min((c.handled for c in self._known.values()), default=seq)
 
@@ -178,8 +178,8 @@ class Consumers:
             name: Name of the consumer.
             seq: Offset of the first message that was not published.
             now_s: Event-loop time at which the messages count as sent.
-            repeat_after_s: Time after which the first message that has not arrived counts as lost,
-                seconds, even if later messages were sent meanwhile.
+            repeat_after_s: Time after which the first missing message counts as lost, seconds.
+                Messages that are sent later do not extend this time.
         """
         consumer = self._known[name]
         if consumer.missing_seq != consumer.arrived:
@@ -195,12 +195,11 @@ class Consumers:
         return messages
 
     def skip(self, first: int, since: int = 0) -> bool:
-        """Let consumers continue after messages that the producer no longer has.
+        """Let consumers skip the messages that the producer no longer has.
 
         Args:
             first: Offset of the first message that the producer still has.
-            since: Leave a consumer unchanged if it has not handled every message before this
-                offset.
+            since: A consumer skips messages only if it has handled all messages before this offset.
 
         Returns:
             True if a consumer now continues at `first`, and therefore misses messages.
@@ -259,7 +258,8 @@ class Consumers:
     def evict(self, name: str) -> None:
         """Treat a stalled consumer as disconnected.
 
-        This ends when the consumer sends a credit message for which `is_still_stuck` is False.
+        The consumer stays disconnected until it sends a credit message for which `is_still_stuck`
+        is False.
         """
         self._evicted[name] = self._known[name].handled
         self.leave(name)
@@ -268,9 +268,9 @@ class Consumers:
         """Return whether an evicted consumer sent this credit message without having made progress.
 
         Progress is a message handled since the eviction. Credit messages alone are no progress,
-        because a consumer repeats them with each heartbeat. A consumer that has handled all that it
-        received is not stuck: the network lost the other messages, which are retransmitted only to
-        a connected consumer.
+        because a consumer repeats them with each heartbeat. A consumer that has handled all
+        messages that it received is not stuck: it waits for messages that the network has lost. The
+        producer retransmits these only to connected consumers, so it must connect it again.
         """
         has_work = grant.handled < grant.arrived
         return has_work and grant.handled <= self._evicted.get(grant.consumer, -1)

@@ -8,12 +8,12 @@ ignore the first new corrections.
 
 If a reset does not reach all actors, some states are from before the reset and some from after it.
 `Control` therefore writes a marker to the disk before the first actor is reset. It removes the
-marker once the empty states of all actors are on the disk as a generation, the copy of all states
-to which the service falls back (`generations`). While the marker exists, all actors are paused, and
-the next start of the service completes the reset.
+marker once the empty states of all actors are on the disk as a generation. A generation is a synced
+copy of all states, to which the service can fall back (`generations`). While the marker exists, all
+actors are paused, and the next start of the service completes the reset.
 
-An actor that is reset connects to its producers only when it is resumed. Before, a producer that is
-not reset yet would send it messages of the old run.
+An actor that was reset connects to its producers only when it is resumed. If it connected earlier,
+it could receive messages of the old run from a producer that is not reset yet.
 """
 
 import asyncio
@@ -189,7 +189,7 @@ class Control:
             # The actors stay paused: some still have messages of the old run for the others.
             raise ControlError(
                 f"{error} Frames are dropped until the reset is complete. A restart of the service "
-                "completes it too."
+                "also completes the reset."
             ) from error
         self._is_reset_pending = False
         await self._resume_actors()
@@ -212,9 +212,10 @@ class Control:
         else:
             return
         raise ControlError(
-            "all actors are empty, but the older generation of their states, to which the service "
-            f"falls back after a power cut, cannot be replaced: {problem}. A power cut could bring "
-            "back the old map. If the disk is full, free some space, then repeat the command."
+            "all actors are empty, but the older copy of their states on the disk cannot be "
+            f"replaced: {problem}. A power cut could bring back the old map, because the service "
+            "then falls back to this copy. If the disk is full, free some space. Then repeat the "
+            "command."
         )
 
     async def _resume_actors(self) -> None:

@@ -66,7 +66,7 @@ class LoggedInput(NamedTuple):
 
 
 def logged_input(actor: Actor, delivery: Delivery | None) -> LoggedInput | None:
-    """Return the write-ahead log entry of an actor's step; None unless `Actor.lags`.
+    """Return the write-ahead log entry of an actor's step; None if `actor.lags` is False.
 
     Args:
         actor: The actor, with the flow status of the step.
@@ -121,11 +121,10 @@ class RestoredState:
 
 
 class DeliveryState:
-    """Builder of the state that a stage saves: its messages and the state of its actor.
+    """Builder of the saved state of a stage: actor's state, offsets, outbox and write-ahead log.
 
-    The result consists of named parts.
-
-    An unchanged part stays the same object, so that the store does not write it again.
+    The saved state consists of named parts. An unchanged part stays the same object, so that the
+    store does not write it again.
     """
 
     def __init__(self) -> None:
@@ -144,14 +143,14 @@ class DeliveryState:
 
         Args:
             own: State of the actor, by part.
-            taken: Input of the last step; None unless `Actor.lags`, because the `own` of any other
-                actor includes the last step.
-            whole: True if `own` is a checkpoint: it includes the last step and needs no log.
+            taken: Input of the last step; None if `Actor.lags` is False. The `own` of such an actor
+                always includes the last step.
+            whole: True if `own` is a checkpoint, which includes the last step.
 
         Returns:
-            Parts to save: those of `own`, and the inputs handled since `own`. A part of `own` that
-            is another object than in the last call shows that `own` includes the last step. The
-            write-ahead log is then empty.
+            The parts of `own` and the entries of the log. The log has the inputs of the steps that
+            `own` does not include. The log is empty if `whole` is True. It is also empty if a part
+            of `own` is a new object since the last call: `own` then includes all steps.
         """
         is_new = own.keys() != self._own.keys() or any(own[p] is not self._own[p] for p in own)
         if is_new or whole:

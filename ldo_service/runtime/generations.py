@@ -6,10 +6,11 @@ generation is synced to the disk. The states of all actors in it belong together
 handled a message that its producer has not produced, and each producer still has all messages that
 a consumer has not handled.
 
-`GenerationKeeper` asks the actors one after the other, consumers first, so that a producer is newer
-than its consumers. It then compares the positions in all states. If they are consistent, it writes
-the number of the generation to the marker file, which completes the generation. The previous
-generation is deleted when the next one is kept.
+`GenerationKeeper` asks the actors one after the other, consumers first, so that the state of a
+producer is newer than those of its consumers. It then compares the positions on all topics in these
+states. If the positions are consistent, it writes the number of the generation to the marker file,
+which completes the generation. When the service begins another generation, it deletes all others
+except the last complete one.
 """
 
 import asyncio
@@ -46,6 +47,8 @@ INTERDEPENDENT_ACTORS = ("tracker", "mapper", "optimizer")
 def completed_generation(store: FolderStore) -> int | None:
     """Return the number of the last complete generation; None if there is none.
 
+    A generation is a synced copy of the states of all actors.
+
     Raises:
         DamagedStateError: The marker file is damaged.
         DataError: Another version of the service wrote the marker file.
@@ -72,8 +75,8 @@ def complete_generation(store: FolderStore, number: int) -> None:
 def confirm_completed(store: FolderStore) -> int:
     """Write the marker file again, and return the number of the last complete generation.
 
-    If an earlier sync of the marker file failed, a reader finds its new content, but a power cut
-    may bring back the old one. No generation may be deleted until this function has succeeded.
+    After a failed sync, a reader finds the new marker file, but a power cut may bring back the old
+    file. No generation may be deleted until this function has succeeded.
 
     Returns:
         The number; 0 if there is no complete generation, or if the marker file is damaged.
@@ -95,6 +98,8 @@ def confirm_completed(store: FolderStore) -> int:
 def actors_of_completed(store: FolderStore) -> set[str]:
     """Return the actors that have a state in the last complete generation.
 
+    A generation is a synced copy of the states of all actors.
+
     Raises:
         DamagedStateError: The marker file is damaged.
         DataError: Another version of the service wrote the marker file.
@@ -109,8 +114,9 @@ def problem_of_completed(
 ) -> DataError | str | None:
     """Check the states of the last complete generation: synced copies of the states of all actors.
 
-    An actor may have no state in it, because it had none at that time. The marker file
-    (`generation.msgpack`) lists the actors that had one: a missing state of theirs is a problem.
+    The marker file (`generation.msgpack`) lists the actors that have a state in the generation. A
+    missing state of a listed actor is a problem. Actors without a state at that time are not
+    listed.
 
     Args:
         store: Store of the states.
@@ -150,7 +156,8 @@ def problem_of_states(
     Args:
         store: Store of the states.
         actors: The actors.
-        generation: Number of a generation; by default the states after the last steps.
+        generation: Number of the generation to check. By default, the function checks the states
+            that the actors saved after their last steps.
         is_quick: Read only the positions on each topic, and not the states themselves.
 
     Returns:
@@ -211,7 +218,7 @@ def _inconsistent_states(pasts: Mapping[str, RestoredState]) -> Iterator[str]:
 
 
 class GenerationKeeper:
-    """Task of a running service that regularly keeps the states of its actors as a generation.
+    """Task of a running service that regularly writes a generation to the disk.
 
     A generation is a synced copy of the states of all actors, to which the service falls back.
     """
@@ -238,8 +245,8 @@ class GenerationKeeper:
     def age_s(self) -> float:
         """Return the time since the last complete generation was up to date, seconds.
 
-        A generation is up to date until an actor handles a further message. Any thread may call
-        this method.
+        A generation is a synced copy of the states of all actors. It is up to date until an actor
+        handles another message. Any thread may call this method.
         """
         return time.monotonic() - self._current_s
 
@@ -312,7 +319,7 @@ class GenerationKeeper:
         return ""
 
     def close(self) -> None:
-        """Close the client of the stages."""
+        """Close the client that sends commands to the stages."""
         self._commander.close()
 
     def _read_positions(self) -> list[str]:
@@ -324,14 +331,16 @@ class GenerationKeeper:
 def keep_stopped(
     store: FolderStore, actors: Sequence[str], number: int, completed: int = 0
 ) -> None:
-    """Keep a complete generation of the states of actors that do not run.
+    """Keep the states of stopped actors as a complete generation.
+
+    A generation is a synced copy of the states of all actors.
 
     Args:
         store: Store of the states.
         actors: The actors.
         number: Number of the generation; no earlier generation has it.
-        completed: Number of the last complete generation, which stays whole until this one is
-            complete; 0 if there is none.
+        completed: Number of the last complete generation; 0 if there is none. That generation is
+            not deleted before the new one is complete.
 
     Raises:
         OSError: The disk is full or cannot be written.
@@ -345,7 +354,8 @@ def keep_stopped(
 def keep_last(store: FolderStore, actors: Sequence[str]) -> None:
     """Sync the states of all actors after they have stopped, and keep them as a generation.
 
-    A power cut after this call loses nothing.
+    A generation is a copy to which the service can fall back. A power cut after this call loses
+    nothing.
 
     Raises:
         OSError: The disk is full or cannot be written.

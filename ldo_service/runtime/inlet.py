@@ -206,8 +206,8 @@ class LosslessInlet(Inlet):
     def grant(self, consumer: str, *, waits_for_disk: bool = False) -> ConsumerHello | Credit:
         """Return the message to send to the producer.
 
-        It is a hello until the producer has sent its hello. After that, it is the credit: the range
-        of messages that the producer may send.
+        The message is a hello (handshake) until the producer has sent its own hello. After that, it
+        is the credit: the range of messages that the producer may send.
 
         Args:
             consumer: Name of the actor with this input.

@@ -82,7 +82,7 @@ class StepRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Gap(msgspec.Struct, frozen=True, kw_only=True):
-    """Journal entry in place of entries that are missing from here on."""
+    """Journal entry that replaces all missing entries of a gap in the journal."""
 
     step: int  # Number of the first missing step.
     # The disk was too slow (slow), the recording reached its maximum size (limit), or a saved state
@@ -100,7 +100,7 @@ CHANNELS: Mapping[type[Entry], str] = {
 
 
 def digest(*bodies: bytes | memoryview) -> str:
-    """Compute the BLAKE2b digest (16 bytes, hexadecimal) of bodies in order."""
+    """Compute one BLAKE2b digest (16 bytes, hexadecimal) of message bodies, in order."""
     state = hashlib.blake2b(digest_size=16)
     for body in bodies:
         state.update(len(body).to_bytes(8, "little"))
@@ -133,12 +133,12 @@ class Journal:
         """Record the files that a saved state refers to; called before each start of the actor."""
 
     def record_start(self, state: State | None) -> None:
-        """Record the start of an actor with its saved state, or None if it has no saved state."""
+        """Record the start of an actor; `state` is its saved state, or None if it has none."""
 
     def record_input(self, delivery: Delivery, stamp_ns: int) -> None:
         """Record the input of the next step, and the stamp of its message in ns.
 
-        If the step fails, the repeated step has the same input.
+        If the step fails, the stage repeats it with the same input, without another call.
         """
 
     def record_step(
@@ -158,7 +158,7 @@ class Journal:
         """
 
     def close(self) -> "Future[None]":
-        """Stop recording; the future is done when all recorded entries are written."""
+        """Stop recording; the returned future is done when all recorded entries are written."""
         future: Future[None] = Future()
         future.set_result(None)
         return future

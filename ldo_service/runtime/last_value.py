@@ -1,4 +1,4 @@
-"""Last value of a state topic, which is the reply to queries of late subscribers."""
+"""Last value of a state topic, kept to answer the queries of late subscribers."""
 
 from ldo_service.schemas import Message
 
@@ -12,7 +12,7 @@ class LastValue:
         self.parts: tuple[tuple[bytes, bytes], ...] = ()
 
     def add(self, message: Message, header: bytes, body: bytes) -> None:
-        """Add one message of a new value, which replaces the last value once it is complete."""
+        """Add one message of a new value; the complete new value replaces the last value."""
         if getattr(message, "part", 0) == 0:
             self._incomplete.clear()
         self._incomplete.append((header, body))

@@ -59,11 +59,11 @@ class ActorThread:
     step_ms: list[float] = field(default_factory=list)
 
     def start(self, message: Message) -> Future[StepOutput]:
-        """Start the step for a message in the thread of the actor."""
+        """Start to process a message; the step runs in the thread of the actor."""
         return self.thread.submit(self._step, message)
 
     def finish(self) -> Future[StepOutput]:
-        """Start publishing the final messages in the thread."""
+        """Start publishing the actor's final messages in the actor's thread."""
         return self.thread.submit(lambda: _timed(self.actor.on_stop()))
 
     def _step(self, message: Message) -> StepOutput:

@@ -1,6 +1,7 @@
-"""Mailbox: bounded queue of all inputs of one actor, in order of arrival.
+"""Mailbox: bounded queue of the messages that arrive for one actor.
 
-Messages of inputs with priority are taken first. Each dropped message is counted.
+The actor takes messages of inputs with priority first, and the other messages in order of arrival.
+The mailbox counts each message that it drops.
 """
 
 import asyncio
@@ -39,11 +40,11 @@ MAX_WAITING_BYTES = 128_000_000
 
 
 class Mailbox:
-    """Queue of all inputs of an actor.
+    """Queue of the messages that arrive for one actor.
 
-    Any thread may add messages; only the event loop takes them. A delivery counts as handled when
-    `done` is called. If the actor's process is killed before this call, the restored actor receives
-    the message again, unless the input has policy `Latest`.
+    Any thread may add messages; only the event loop takes them. A queued message is a `Delivery`,
+    and it counts as handled after `done`. If the process is killed before `done`, a lossless input
+    receives the message again after the restart. An input with policy `Latest` loses it.
     """
 
     def __init__(
@@ -192,17 +193,19 @@ class Mailbox:
 
     # --- taking, on the event loop --------------------------------------------------------------
     async def take(self, timeout_s: float | None = None) -> Delivery | StageCommand | None:
-        """Wait for the next command or delivery and take it.
+        """Wait for the next command or received message, and remove it from the queue.
+
+        Commands come first, then messages of inputs with priority, then the other messages. Among
+        equals, the oldest comes first.
 
         Args:
             timeout_s: Maximum time to wait, seconds; None: no limit.
 
         Returns:
-            A command if there is one, else the oldest delivery of an input with priority, else the
-            oldest delivery. None if the mailbox is closed and empty.
+            A command or a message, or None if the mailbox is closed and empty.
 
         Raises:
-            TimeoutError: Neither a command nor a delivery arrived within `timeout_s`.
+            TimeoutError: Neither a command nor a message arrived within `timeout_s`.
         """
         # `asyncio.wait_for` of Python 3.11 may swallow the cancellation of a stage.
         async with asyncio.timeout(timeout_s):
@@ -225,7 +228,7 @@ class Mailbox:
             await self._ready.wait()
 
     def done(self, delivery: Delivery, rejected: bool = False) -> None:
-        """Mark a delivery as handled or rejected, so that it is not sent again."""
+        """Mark a message as handled or rejected, so that the producer does not send it again."""
         inlet = self._inlets[delivery.port.topic.name]
         with self._lock:
             inlet.done(delivery, rejected)
@@ -233,10 +236,13 @@ class Mailbox:
             self._send_grant(inlet)
 
     def past(self, being_handled: Delivery | None = None) -> dict[str, InletPosition]:
-        """Return the position to save for each lossless topic, by topic name.
+        """Return the position on each lossless topic, to be saved with the state of the actor.
 
         Args:
-            being_handled: The delivery of the current step, which counts as handled.
+            being_handled: The message of the current step, which then counts as handled.
+
+        Returns:
+            The epoch and the number of the first unhandled message, by topic name.
         """
         with self._lock:
             return {
@@ -248,10 +254,10 @@ class Mailbox:
             }
 
     def put_command(self, order: StageCommand) -> list[StageCommand]:
-        """Queue a command; `take` returns it before all deliveries.
+        """Queue a command; `take` returns commands before messages.
 
-        A command `keep` replaces earlier commands `keep` in the queue. Otherwise, an actor that was
-        busy for minutes would keep its state once for each of these commands.
+        The command `keep` makes the actor copy its saved state. A new `keep` command replaces
+        those in the queue, so that an actor that was busy for long copies its state only once.
 
         Args:
             order: The command.
@@ -265,9 +271,10 @@ class Mailbox:
         return replaced
 
     def pause(self) -> None:
-        """Let `take` return only commands until `resume`.
+        """Let `take` return only commands until `resume` is called.
 
-        Inputs with policy `Latest` drop their messages and count them. Lossless inputs keep theirs.
+        Meanwhile, inputs with policy `Latest` drop and count their messages. Lossless inputs keep
+        their messages in the queue.
         """
         with self._lock:
             self._held = True
@@ -276,7 +283,7 @@ class Mailbox:
             self._keep_only_waiting()
 
     def resume(self) -> None:
-        """Let `take` return deliveries again, after `pause`."""
+        """End the pause: let `take` return messages again."""
         with self._lock:
             self._held, is_connecting, self._connects = False, not self._connects, True
         if is_connecting:
@@ -285,11 +292,14 @@ class Mailbox:
 
     @property
     def is_held(self) -> bool:
-        """True between `pause` and `resume`."""
+        """True while the mailbox is paused."""
         return self._held
 
     def reset(self) -> None:
-        """Clear all queues and connect to the producers again, after `resume` if paused."""
+        """Clear all queues and connect to the producers again.
+
+        A paused mailbox connects only after `resume`.
+        """
         with self._lock:
             self._connects = not self._held
             for inlet in self._inlets.values():
@@ -303,10 +313,11 @@ class Mailbox:
         self._order = deque(d for d in self._order if id(d) in waiting)
 
     def send_credits(self) -> None:
-        """Send the current credit of every lossless input to its producer.
+        """Send the credit of each lossless input to its producer.
 
-        The stage calls this method with each heartbeat, because a credit message may be lost. A
-        producer that has not sent its hello yet receives a hello instead of a credit.
+        The credit is the range of messages that the producer may send. The stage calls this method
+        with each heartbeat, because the network may lose a credit message. Until the producer has
+        sent its hello, this method sends the hello of the consumer instead of the credit.
         """
         with self._lock:
             self._grant_pending = False
@@ -322,18 +333,18 @@ class Mailbox:
         self._grants[inlet.port.topic.name].post(b"", encode_link(grant))
 
     def close(self) -> None:
-        """Accept no more messages; queued ones can still be taken."""
+        """Accept no more messages; `take` still returns the queued messages."""
         with self._lock:
             self._closed, self._held = True, False
         self._ready.set()
 
     def disconnect(self) -> None:
-        """Close the publishers of credit messages."""
+        """Close the publishers that send credit messages to the producers."""
         for publisher in self._grants.values():
             publisher.close()
 
     def waiting(self) -> dict[Topic, int]:
-        """Return the number of queued messages of each lossless input."""
+        """Return the number of queued messages of each lossless input, by topic."""
         with self._lock:
             return {
                 inlet.port.topic: len(inlet.waiting)
@@ -342,7 +353,7 @@ class Mailbox:
             }
 
     def counts(self) -> tuple[InputCount, ...]:
-        """Return the counters of all inputs for the health message."""
+        """Return the message counters of each input, for the health message of the stage."""
         with self._lock:
             return tuple(inlet.counts() for inlet in self._inlets.values())
 

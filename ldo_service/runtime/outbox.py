@@ -17,12 +17,11 @@ MAX_RETAINED_BYTES = 64_000_000
 
 
 class Outbox:
-    """Numbered messages in order, in memory or on disk.
+    """Store of the numbered messages of a topic, in memory or in a log on disk.
 
-    They are on disk if a consumer may be far behind.
-
-    Without a log, all messages are in memory, and the stage saves them with its state. With a log,
-    `store` writes them to disk, and only the newest stay in memory.
+    An outbox has a log if a consumer may be far behind. `store` then writes the messages to the
+    log, and only the newest messages stay in memory. An outbox that has no log holds all messages
+    in memory, and the stage saves them with its state.
     """
 
     def __init__(
@@ -61,29 +60,29 @@ class Outbox:
 
     @property
     def in_memory(self) -> tuple[UnackedMessage, ...]:
-        """Messages to save with the state of the stage; none if they are in a log."""
+        """Messages that the stage saves with its state; empty if a log on disk has them."""
         return () if self._log else tuple(self._memory)
 
     @property
     def dropped(self) -> int:
-        """Number of messages dropped because of the maximum size."""
+        """Number of messages dropped because the outbox reached its maximum size."""
         return self._dropped + (self._log.dropped if self._log else 0)
 
     @property
     def size_bytes(self) -> int:
-        """Size of the messages on disk, or in memory if there is no log, bytes."""
+        """Size of the messages in bytes: in the log on disk, or in memory if there is no log."""
         return self._log.size_bytes if self._log else self._bytes
 
     @property
     def max_bytes(self) -> int | None:
-        """Maximum of `size_bytes`; None if there is no maximum."""
+        """Maximum size of the messages, bytes; None if the size is not limited."""
         return self._log.max_bytes if self._log else self._max_bytes
 
     def first(self, end: int) -> int:
-        """Return the number of the first message; `end` if there is none.
+        """Return the number of the oldest message in the outbox.
 
         Args:
-            end: Number after the last message.
+            end: Number to return if the outbox is empty.
         """
         with self._lock:
             in_memory = self._memory[0].seq if self._memory else end
@@ -91,7 +90,7 @@ class Outbox:
         return min(in_memory, in_log)
 
     def add(self, message: UnackedMessage) -> None:
-        """Add the next message."""
+        """Add the next message; drop the oldest messages if the outbox exceeds its maximum size."""
         with self._lock:
             self._memory.append(message)
             self._bytes += len(message.body)
@@ -100,7 +99,9 @@ class Outbox:
                 self._dropped += 1
 
     def store(self) -> None:
-        """Write the messages to the log, if there is one; may be called on any thread.
+        """Write new messages to the log; do nothing if there is no log.
+
+        This method may be called on any thread.
 
         Raises:
             OSError: The log cannot be written. All messages stay in memory.
@@ -115,9 +116,9 @@ class Outbox:
                 self._bytes -= len(self._memory.popleft().body)
 
     def read(self, seq: int) -> UnackedMessage | None:
-        """Return message `seq`, or None if it is lost.
+        """Return the message with number `seq`, or None if the outbox no longer has it.
 
-        The call may read the disk, so it belongs in a thread.
+        Call this method in a thread other than the event loop's, because it may read the disk.
         """
         with self._lock:
             if self._memory and self._memory[0].seq <= seq <= self._memory[-1].seq:
@@ -126,11 +127,11 @@ class Outbox:
         return UnackedMessage(*found) if found else None
 
     def after(self, seq: int, end: int) -> int:
-        """Return the number of the next message that may be readable after a lost message.
+        """Return the number of the message to read next, after message `seq` could not be read.
 
         Args:
-            seq: Number of the lost message.
-            end: Number after the last message.
+            seq: Number of the message that could not be read.
+            end: Number to return if the outbox has no later message.
         """
         with self._lock:
             later = [message.seq for message in self._memory if message.seq > seq]
@@ -138,27 +139,30 @@ class Outbox:
         return min(in_memory, self._log.after(seq, end) if self._log else end)
 
     def first_needed(self, handled: int) -> int:
-        """Return the number of the first message that a consumer or a generation needs.
+        """Return the number of the first message that is still needed.
 
-        A generation is an older copy of all saved states; see `keep`.
+        A message is needed until all consumers have handled it. It is also needed while the service
+        may fall back to older copies of the actors' states (a generation, see `keep`).
 
         Args:
-            handled: All consumers have handled the messages before this number.
+            handled: Number of the first message that a consumer has not handled.
         """
         return min([handled, *self._handled_at_keeps[:1]])
 
     def keep(self, handled: int, *, is_previous_complete: bool) -> None:
-        """Retain the messages that the next generation of the states needs.
+        """Retain the messages that consumers need if the service falls back to older states.
 
-        The consumers keep their states first (`runtime.generations`). Until this producer keeps its
-        own state, they may handle further messages, which their kept states still need. The kept
-        states are newer than the previous call of this method. The outbox therefore retains all
-        messages that were unhandled at that call.
+        The stage calls this method when the producer copies its state for a new generation.
+
+        A generation has copies of the states of all actors; see `runtime.generations`. The
+        consumers copy their states before the producer does, and then handle further messages. A
+        consumer that is restored from its copy needs these messages again. The outbox therefore
+        retains all messages that were unhandled when `keep` was called for the previous generation.
 
         Args:
-            handled: All consumers have handled the messages before this number.
-            is_previous_complete: Whether the generation of the previous call is complete, so that
-                no older one is needed.
+            handled: Number of the first message that a consumer has not handled.
+            is_previous_complete: Whether the previous generation is complete. If it is, the outbox
+                no longer retains messages for generations before it.
         """
         if is_previous_complete:
             del self._handled_at_keeps[:-2]
@@ -169,8 +173,8 @@ class Outbox:
     def forget(self, before: int) -> None:
         """Delete the messages before number `before`, which all consumers have handled.
 
-        Messages that a generation (an older copy of all saved states) needs are kept, see `keep`.
-        An outbox that is not on the disk keeps them only while it has at most
+        Messages that a generation (copies of the states of all actors) needs stay in the outbox;
+        see `keep`. An outbox in memory retains them only while its size is at most
         `MAX_RETAINED_BYTES`.
         """
         if self._log and not self._is_kept and self._log.size_bytes > MAX_RETAINED_BYTES:
@@ -185,7 +189,7 @@ class Outbox:
                 self._bytes -= len(self._memory.popleft().body)
 
     def truncate(self, end: int) -> None:
-        """Delete the messages with numbers of at least `end`, which were never sent."""
+        """Delete the messages from number `end` on; they were never sent."""
         with self._lock:
             while self._memory and self._memory[-1].seq >= end:
                 self._bytes -= len(self._memory.pop().body)
@@ -193,11 +197,15 @@ class Outbox:
             self._log.truncate(end)
 
     def pop_unsynced(self) -> list[Path]:
-        """Return the files of the log that are not synced to the disk yet."""
+        """Return the files and folders of the log that the caller must sync to the disk."""
         return self._log.pop_unsynced() if self._log else []
 
     def restart(self, epoch: int) -> None:
-        """Delete all messages and begin at number 0 of a new epoch."""
+        """Delete all messages and restart the numbering at 0.
+
+        Args:
+            epoch: Number that identifies the new numbering.
+        """
         with self._lock:
             self._memory.clear()
             self._bytes = 0

@@ -36,14 +36,14 @@ log = logging.getLogger(__name__)
 class Outlet:
     """Sending half of a topic, with credit-based flow control for lossless consumers.
 
-    The outlet numbers messages, waits for credit from every consumer with policy `Lossless`, and
-    retransmits lost messages. Required consumers (`expected`) must not miss a message, so there is
-    no credit while one of them is disconnected. Other consumers limit the credit only while they
-    are connected. The outlet of a nonblocking port does not wait, because the actor checks the
-    credit before it yields a message.
+    Credit is the number of messages that a consumer allows the outlet to send. The outlet numbers
+    messages, waits for credit from each consumer with policy `Lossless`, and retransmits lost
+    messages. Required consumers (`expected`) must not miss a message: the outlet also waits while
+    one of them is disconnected. The outlet of a nonblocking port never waits, because the actor
+    checks the credit before it yields a message.
 
-    The outlet never waits for a consumer with policy `Backlog`. It keeps the unhandled messages in
-    its outbox on disk, and sends them as the consumer grants credit.
+    The outlet never waits for a consumer with policy `Backlog`. It stores the unhandled messages on
+    disk, and sends them when the consumer grants credit.
     """
 
     # Time after which a message counts as lost, seconds: half a credit period. A shorter time would
@@ -115,8 +115,8 @@ class Outlet:
     def credits(self) -> int:
         """Return the number of messages that may be sent now; 0 while staged messages wait.
 
-        If the port is nonblocking and all required consumers have policy `Backlog`, the result is
-        the number of messages that fit into the consumers' windows, so that no backlog grows.
+        Consumers with policy `Backlog` limit it only if the port is nonblocking and all required
+        consumers have this policy. The result then fits into their queues, so no backlog grows.
         """
         if self._unsent:
             return 0
@@ -125,12 +125,12 @@ class Outlet:
         return self._consumers.credits(self._seq)
 
     async def send(self, message: Message, body: bytes) -> None:
-        """Stage one message and commit it."""
+        """Send one message; wait for credit unless the port is nonblocking."""
         self.stage_message(message, body)
         await self.commit()
 
     def stage_message(self, message: Message, body: bytes) -> None:
-        """Assign the next number to a message and stage it for the next `commit`."""
+        """Assign the next number to a message, and hold it until `commit` or `rollback`."""
         key = str(getattr(message, self.topic.key)) if self.topic.key else ""
         header = encode_link(Header(self._source, self._epoch, self._seq, message.stamp_ns, key))
         held = UnackedMessage(self._seq, header, body)
@@ -153,7 +153,7 @@ class Outlet:
             await self._publisher.send(held.header, held.body)
 
     def rollback(self) -> None:
-        """Discard the staged messages and reuse their numbers."""
+        """Discard the staged messages; later messages get their numbers."""
         self._seq = self._next
         self.outbox.truncate(self._seq)
         self._unsent.clear()
@@ -179,7 +179,7 @@ class Outlet:
     async def flush(self) -> None:
         """Wait until every lossless consumer has received all messages.
 
-        Wait at most `FLUSH_BACKLOG_S` for consumers with policy `Backlog`; they may be stopped.
+        Wait at most `FLUSH_BACKLOG_S` for consumers with policy `Backlog`, which may be stopped.
         """
         self._post_hellos()  # Each consumer immediately replies with its credit.
         while not self._consumers.all_received(self._seq, awaited_only=True):
@@ -195,11 +195,11 @@ class Outlet:
 
     @property
     def handled(self) -> int:
-        """Offset of the first message that at least one consumer has not handled."""
+        """Number of the first message that at least one consumer has not handled."""
         return min(self._consumers.handled(self._seq), self._seq)
 
     def position(self) -> OutletPosition | None:
-        """Return the position to save: the next offset, and the unhandled messages.
+        """Return what the next start needs: the unhandled messages, and the next message number.
 
         The result is None if the topic has no required consumer.
         """
@@ -238,7 +238,7 @@ class Outlet:
         self._post_hellos()
 
     def reset(self, epoch: int) -> None:
-        """Restart numbering at 0 under a new epoch; all consumers must connect again."""
+        """Restart message numbers at 0 in a new epoch; all consumers must connect again."""
         self._cancel_repeating()
         self._epoch, self._seq = epoch, 0
         past = self._consumers
@@ -360,7 +360,7 @@ class Outlet:
             self._changed.set()
 
     def evict_stalled(self, now_s: float) -> None:
-        """Evict connected consumers whose window has been full for over `evict_after_s`."""
+        """Evict consumers whose window of unhandled messages is full for over `evict_after_s`."""
         overdue = self._consumers.stalled(now_s, self._evict_after_s, self._next)
         for name in overdue:
             log.error(
@@ -378,7 +378,7 @@ class Outlet:
 
     # --- counters and close ----------------------------------------------------------------
     def counts(self) -> OutputCount:
-        """Return the counters for the health message."""
+        """Return the message counters of this topic, for the health message of the stage."""
         return OutputCount(
             topic=self.topic.name,
             sent=self.sent,
@@ -392,7 +392,7 @@ class Outlet:
         )
 
     def close(self) -> None:
-        """Cancel retransmission and close the publishers."""
+        """Cancel all retransmissions and close the topic on the network."""
         self._closed = True
         self._cancel_repeating()
         own = self._publisher, self._retransmissions, self._hellos

@@ -1,4 +1,4 @@
-"""Outlets of one actor; an outlet sends the messages of one topic to their consumers."""
+"""Outlets of one actor; each outlet sends the messages of one topic to its consumers."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,14 +20,15 @@ from .supervision_policy import SupervisionConfig
 
 @dataclass(frozen=True, slots=True)
 class OutletOpener:
-    """Opener of the outlets of a stage. An outlet is the sending half of a topic.
+    """Factory of the outlets of a stage. An outlet is the sending half of a topic.
 
     Each outlet continues the message numbers of the actor's previous process.
 
     Attributes:
         transport: The network.
         config: Limits of supervision.
-        store: Storage of the state. Backlogs are on disk if the state is on disk, else in memory.
+        store: Storage of the state. Unhandled messages for consumers with policy `Backlog` are on
+            disk if the state is on disk, else in memory.
         expected: Names of the required consumers, by topic name.
         with_backlog: Names of the required consumers with policy `Backlog`, by topic name.
         on_evicted: Called with the name of an evicted consumer.
@@ -47,8 +48,8 @@ class OutletOpener:
 
         Args:
             port: The output of the actor.
-            source: Name of the actor, and the epoch, which identifies a numbering of messages. The
-                epoch is used only if `past` does not have the topic.
+            source: Name of the actor, and the epoch, a number that identifies a numbering of
+                messages. The epoch is used only if `past` has no position for the topic.
             past: Saved position of each outlet of the previous process, by topic name.
         """
         name, epoch = source
@@ -108,12 +109,12 @@ class Outlets:
 
     @property
     def is_nonblocking(self) -> bool:
-        """True if one of the ports is nonblocking."""
+        """True if at least one output port is nonblocking."""
         return any(outlet.port.is_nonblocking for outlet in self._all.values())
 
     @property
     def has_required_consumers(self) -> bool:
-        """True if a topic has a required consumer, which must not miss a message."""
+        """True if at least one topic has a required consumer, which must not miss a message."""
         return any(outlet.position() for outlet in self._all.values())
 
     def credits(self) -> dict[Topic, int]:
@@ -125,9 +126,11 @@ class Outlets:
         }
 
     def past(self) -> dict[str, OutletPosition | None]:
-        """Return the position of each outlet to save with the state of the actor, by topic name.
+        """Return the position of each outlet, to be saved with the state of the actor.
 
-        See `Outlet.position`; it is None if the topic has no required consumer.
+        Returns:
+            The result of `Outlet.position` by topic name; None for a topic that has no required
+            consumer.
         """
         return {outlet.topic.name: outlet.position() for outlet in self._all.values()}
 
@@ -139,10 +142,9 @@ class Outlets:
     async def release(self, *, is_saved: bool = True) -> None:
         """Send the outputs of a step that `stage_outputs` holds.
 
-        If the step is not saved, outputs on topics with required consumers are held further.
-
         Args:
-            is_saved: Whether the step is saved.
+            is_saved: Whether the step is saved. If it is not, outputs on topics with required
+                consumers are not sent yet.
         """
         for outlet in self._all.values():
             if is_saved or outlet.position() is None:
@@ -168,21 +170,27 @@ class Outlets:
             await outlet.flush()
 
     def restart_numbering(self, epoch: int) -> None:
-        """Restart numbering of all topics under a new epoch."""
+        """Restart the message numbers of all topics at 0.
+
+        Args:
+            epoch: Number that identifies the new numbering.
+        """
         for outlet in self._all.values():
             outlet.reset(epoch)
 
     def keep(self, *, is_previous_complete: bool) -> None:
-        """Retain the messages that the next generation of the states needs; see `Outbox.keep`.
+        """Retain the messages that consumers need if the service falls back to older states.
+
+        See `Outbox.keep`. A generation has copies of the states of all actors.
 
         Args:
-            is_previous_complete: Whether the previous generation of the states is complete.
+            is_previous_complete: Whether the previous generation is complete.
         """
         for outlet in self._all.values():
             outlet.outbox.keep(outlet.handled, is_previous_complete=is_previous_complete)
 
     def pop_unsynced(self) -> list[Path]:
-        """Return the files of the outboxes that are not synced to the disk yet."""
+        """Return the files and folders of the outboxes that the caller must sync to the disk."""
         return [path for outlet in self._all.values() for path in outlet.outbox.pop_unsynced()]
 
     def check_windows(self, now_s: float) -> None:
@@ -195,7 +203,7 @@ class Outlets:
             outlet.evict_stalled(now_s)
 
     def counts(self) -> tuple[OutputCount, ...]:
-        """Return the counters of all outputs for the health message."""
+        """Return the message counters of each output, for the health message of the stage."""
         return tuple(outlet.counts() for outlet in self._all.values())
 
     def close(self) -> None:

@@ -49,9 +49,9 @@ def available_memory_mb() -> float | None:
 def trim_memory() -> None:
     """Give freed memory back to the operating system.
 
-    Otherwise glibc keeps free memory that lies between blocks in use. It kept 280 MB after three
-    laps through the sequence `synthetic:flat`. On systems other than Linux the function does
-    nothing.
+    The allocator of glibc does not return free memory that lies between blocks in use. After three
+    laps through the sequence `synthetic:flat`, 280 MB were not returned. On systems other than
+    Linux, the function does nothing.
     """
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
     if trim is not None:
@@ -59,17 +59,17 @@ def trim_memory() -> None:
 
 
 def raise_file_limit() -> None:
-    """Raise the soft limit of open files to the hard one.
+    """Raise the soft limit of open files of this process to the hard limit.
 
-    systemd and shells set a soft limit of 1024 for programs that use `select`, which this one does
-    not.
+    systemd and shells set a soft limit of 1024, because `select` cannot handle more files. This
+    program does not use `select`.
     """
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
 async def exit_with_parent(period_s: float = 0.5) -> None:
-    """Wait until the parent process has ended, so that the caller can then end this process.
+    """Wait until the parent process has ended; the caller then ends this process.
 
     The function waits forever if no `ChildProcess` started this process.
 
@@ -83,7 +83,7 @@ async def exit_with_parent(period_s: float = 0.5) -> None:
 
 
 class ChildProcess:
-    """Child process of one actor, restarted when it exits or sends no heartbeat in time.
+    """Child process of one actor; it is restarted if it exits or sends no heartbeat in time.
 
     The process has a process group of its own. Ctrl-C at a terminal therefore reaches only the
     parent, which ends its children in order.
@@ -137,11 +137,11 @@ class ChildProcess:
 
     @property
     def pid(self) -> int | None:
-        """Process id of the last started process."""
+        """Process id of the process started last; None before the first start."""
         return self._process.pid if self._process else None
 
     async def run(self) -> None:
-        """Start the process, and restart it until `drain`.
+        """Start the process, and restart it whenever it ends, until `drain` is called.
 
         Raises:
             RestartsExhausted: The restart budget is used up.
@@ -187,7 +187,7 @@ class ChildProcess:
             pipe.close()
 
     def drain(self) -> None:
-        """Request a soft stop."""
+        """Request a soft stop: the process handles its queued messages and ends."""
         self._draining = True
         if self._process and self._process.returncode is None:
             self._process.terminate()
@@ -284,8 +284,8 @@ def _is_suspended(pid: int) -> bool:
 
 
 def python_command(*arguments: str) -> list[str]:
-    """Return the command line that runs `ldo` of this installation with the given arguments.
+    """Return the command line that runs this installation of `ldo` with the given arguments.
 
-    Without `-P`, Python would prefer a package `ldo_service` in the current folder.
+    The option `-P` keeps Python from importing a package `ldo_service` in the current folder.
     """
     return [sys.executable, "-P", "-m", "ldo_service", *arguments]

@@ -1,8 +1,8 @@
 """Heartbeat from a child process to its parent process, over a pipe.
 
-The health message of a stage comes from its event loop. A step that holds the GIL, such as a solve
-of gtsam, stops the event loop for as long as the step lasts. A heartbeat over the pipe comes from a
-thread in C++ that does not need the GIL. It contains the age of the current step.
+The event loop of a stage sends its health messages. A step that holds the GIL, such as a gtsam
+solve, blocks the event loop until the step ends. A C++ thread that does not need the GIL therefore
+sends heartbeats over the pipe. Each heartbeat contains the time since the current step started.
 """
 
 import asyncio

@@ -1,8 +1,9 @@
-"""Quarantine of messages that end the process of their actor.
+"""Quarantine of messages that crash or block the process of the actor that handles them.
 
-A message that raises an exception becomes a dead letter. A message that kills the process (SIGSEGV,
-out of memory) or hangs would be delivered again after every restart. The stage therefore counts the
-deliveries on the disk, before it handles a message.
+If handling a message raises an exception twice, the stage discards the message as a dead letter. A
+message that kills the process (SIGSEGV, out of memory) or hangs would be delivered again after each
+restart. Before a stage handles a message, it therefore writes to disk how often the message was
+delivered.
 """
 
 import asyncio
@@ -32,7 +33,7 @@ _CHECKSUM = struct.Struct("<I")  # CRC-32 of the record, after it.
 
 
 class QuarantinedMessage(msgspec.Struct, frozen=True, kw_only=True):
-    """Content of a file in the quarantine folder, as MessagePack."""
+    """Content of a file in the quarantine folder: one message, encoded as MessagePack."""
 
     topic: str  # Name of the topic.
     source: str  # Header fields of the message; see `flow_control.Header`.
@@ -44,19 +45,19 @@ class QuarantinedMessage(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Quarantine:
-    """Count of the deliveries of the current message, and folder of quarantined messages.
+    """Delivery count of the current message, and folder of quarantined messages.
 
-    Before a stage handles a message of a lossless input, it writes to the disk how often the
-    message was delivered. If the process ends while it handles the message, the restarted stage
-    receives the message again, as a suspected one. After `MAX_DELIVERIES` deliveries, the stage
-    puts the message into the folder instead of handling it.
+    Before a stage handles a message of a lossless input, it writes to disk how often the message
+    was delivered. If the process ends during the handling, the restarted stage receives the message
+    again. The message is then suspected to have ended the process. After `MAX_DELIVERIES`
+    deliveries, the stage writes the message to the folder instead of handling it.
 
-    A process with several actors handles one suspected message at a time. If the process ends
-    again, the deliveries of only that message increase. Messages of other inputs are never
-    delivered again, so they are not counted.
+    The actors of one process handle only one suspected message at a time. If the process ends
+    again, the count of no other suspected message increases. Messages of inputs that are not
+    lossless are never delivered again and therefore not counted.
 
     Attributes:
-        count: Number of quarantined messages since the state folder is in use.
+        count: Number of messages quarantined since the state folder was created.
     """
 
     def __init__(self, folder: Path | None, suspects: asyncio.Lock | None = None) -> None:
@@ -72,15 +73,16 @@ class Quarantine:
             self._load()
 
     def is_due(self, delivery: Delivery) -> bool:
-        """Return whether a message has ended the process too often to be handled again."""
+        """Return whether to quarantine a message, because it has ended the process too often."""
         return self._deliveries_of(delivery) >= MAX_DELIVERIES
 
     @asynccontextmanager
     async def counting(self, delivery: Delivery | None) -> AsyncIterator[None]:
-        """Count a delivery while the block handles it.
+        """Increment the delivery count of a message, then run the block that handles the message.
 
-        The count stays if the process ends inside the block, or if the block is cancelled; see
-        `withdraw`. It is cleared if the block ends in any other way.
+        The count is cleared when the block returns or raises an exception. It stays on disk if the
+        process ends inside the block. It also stays if the block is cancelled; the stage then calls
+        `withdraw`.
         """
         if self._folder is None or delivery is None or not _is_repeated(delivery):
             yield
@@ -96,12 +98,12 @@ class Quarantine:
             self._store(b"", 0)
 
     def withdraw(self) -> None:
-        """Take back the count of the current message, which a stop of the service interrupted."""
+        """Decrement the delivery count of a message whose handling was cancelled by a stop."""
         if self._deliveries:
             self._store(self._key, self._deliveries - 1)
 
     def add(self, actor: str, delivery: Delivery) -> int:
-        """Write a message to the folder, log it, and return the new `count`."""
+        """Write a message to the quarantine folder, log an error, and return the new `count`."""
         assert self._folder is not None
         self.count += 1
         deliveries = self._deliveries

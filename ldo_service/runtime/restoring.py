@@ -20,7 +20,7 @@ LOG_PERIOD_S = 60.0  # Minimum time between two log lines about failed messages,
 
 
 class ActorRestorer:
-    """Restorer of an actor's last saved state, as often as the actor's restart budget allows."""
+    """Restorer of an actor's last saved state after a failure, within a restart budget."""
 
     def __init__(
         self,
@@ -55,11 +55,13 @@ class ActorRestorer:
     async def restart(self, worker: Worker, *, is_charged: bool) -> Actor:
         """Return the restored actor, after a delay that doubles with each failure.
 
+        A failure to handle a message is not charged, because a message that always fails must not
+        use up the restart budget. The stage handles the message again. If that succeeds, the
+        message was not the cause, and the stage charges the failure by `charge`.
+
         Args:
             worker: Thread of the actor.
-            is_charged: Whether the failure counts in the restart budget. It is False for a failed
-                message: if both attempts fail, the fault is in the message, and no message may end
-                the stage. If the second attempt succeeds, the stage calls `charge`.
+            is_charged: Whether the failure counts in the restart budget.
 
         Raises:
             RestartsExhausted: The budget is used up.
@@ -74,8 +76,8 @@ class ActorRestorer:
                 actor = await worker.run(self.restore)
             except DamagedStateError as error:
                 raise DamagedStateError(
-                    f"{error}. At its next start, the service falls back to an older generation of "
-                    "the states, if there is one."
+                    f"{error}. Start the service again: it then falls back to an older copy of the "
+                    "states of all actors, if there is one."
                 ) from error
             except Exception:
                 log.exception(
@@ -92,7 +94,7 @@ class ActorRestorer:
 class FailureLog:
     """Log of failed steps, with at most one line per minute about failed messages.
 
-    Any program may send messages that fail, and they must not fill the log.
+    Any program may send messages that fail. The limit keeps such messages from filling the log.
     """
 
     def __init__(self) -> None:
@@ -104,19 +106,19 @@ class FailureLog:
         Args:
             name: Name of the actor.
             what: Description of the step, such as "handling Keyframe".
-            is_of_message: Whether the step handled a message, so that at most one failure per
-                minute is logged.
+            is_of_message: Whether the step handled a message. At most one such failure per minute
+                is logged.
         """
         if not is_of_message or self._failures.is_due():
             log.exception("%s: %s failed; restoring the actor.", name, what)
 
     def dead_lettered(self, name: str, message: Message, count: int) -> None:
-        """Log a message that failed twice.
+        """Log that a message is discarded, because the actor twice failed to handle it.
 
         Args:
             name: Name of the actor.
-            message: The message.
-            count: Number of messages that have failed twice so far.
+            message: The discarded message.
+            count: Number of messages discarded so far.
         """
         if self._dead_letters.is_due():
             log.error(

@@ -1,7 +1,7 @@
 """Stage: the runtime around one actor.
 
-For each message the stage runs the handler in the actor's own thread, saves the state, sends the
-outputs in order, and acknowledges the input.
+For each message, the stage runs the handler in the actor's own thread. It then saves the state of
+the actor, sends the outputs in order, and acknowledges the message to its producer.
 """
 
 import asyncio
@@ -40,13 +40,13 @@ CHECK_S = 0.5
 
 
 class Stage:
-    """Runtime around one actor; `run` lasts until `drain` or cancellation.
+    """Runtime around one actor.
 
-    Failures: The stage restores the actor and repeats a failed step once. A message that fails
-    twice is discarded as a dead letter. The `journal` receives everything that a step depends on.
-
-    Saving: Only after a step is saved does the stage send its outputs to required consumers and
-    acknowledge its input. While the disk is full, most stages take no messages; see `StateSaver`.
+    If a step fails, the stage restores the actor from its saved state and repeats the step once. It
+    discards a message that fails twice. The stage saves the actor's state after each step. It then
+    sends the step's outputs to required consumers, and acknowledges the message. While the disk is
+    full, most stages take no messages; see `StateSaver`. The `journal` records all that the steps
+    depend on.
     """
 
     def __init__(
@@ -105,7 +105,7 @@ class Stage:
 
     # --- life -----------------------------------------------------------------------------------
     async def run(self) -> None:
-        """Run the stage; may be called once.
+        """Run the stage until `drain` or cancellation; call this method only once.
 
         Raises:
             RestartsExhausted: The actor failed more often than its restart budget allows.
@@ -140,7 +140,7 @@ class Stage:
             await close_journal(self._journal, self.name)
 
     def drain(self) -> None:
-        """Request a soft stop: handle queued messages, publish the final messages, end."""
+        """Request a soft stop: handle queued messages, publish final messages, and then end."""
         self._drain_requested = True
         self._metrics.state = "draining"
         if self._mailbox:

@@ -2,20 +2,20 @@
 
 The service sends commands to its stages over a network that may lose messages:
 
-- `StageCommand` (service to stage): A command to execute between two steps. It is repeated until
-  the reply arrives.
-- `StageReply` (stage to service): Success, or the reason of the failure. It is repeated for each
-  repetition of the command.
+- `StageCommand` (service to stage): A command to execute between two steps. The service repeats the
+  command until the reply arrives.
+- `StageReply` (stage to service): Success, or the reason of the failure. The stage sends the reply
+  again if the command arrives again.
 
 Commands:
 
-- `pause`: Take no messages. Inputs with policy `Latest` drop arriving messages and count them as
-  paused. A file marks a paused service, so that it is paused after a restart too.
+- `pause`: Take no messages. Inputs with policy `Latest` drop arriving messages and count them. A
+  file records that the service is paused, so that it is still paused after a restart.
 - `resume`: Take messages again.
-- `reset`: Start with an empty state and a new epoch.
+- `reset`: Start with an empty state, and number the output messages from 0 again.
 - `save`: Write the whole state now.
-- `keep`: Keep the last saved state as part of a generation, to which the service can fall back; see
-  `generations`.
+- `keep`: Copy the last saved state for a generation: copies of the states of all actors, to which
+  the service can fall back. See `generations`.
 
 `control.Control` gives these commands to all stages of a service.
 """
@@ -65,8 +65,8 @@ class StageReply(msgspec.Struct, frozen=True, array_like=True):
 class CommandReceiver:
     """Receiver of commands in a stage.
 
-    It passes each command to the stage once. If a finished command arrives again, its reply was
-    lost, and the receiver repeats the reply.
+    The receiver passes each command to the stage once. If a finished command arrives again, the
+    receiver sends the reply again, because the first reply may be lost.
     """
 
     def __init__(
@@ -133,11 +133,12 @@ class CommandSender:
             what: The command.
             stage: Name of the stage.
             timeout_s: Maximum time to wait for the reply, seconds.
-            generation: Fields `generation` and `completed` of the command `keep`.
+            generation: For the command `keep`, two numbers: of the generation to keep, and of the
+                last complete generation.
 
         Returns:
-            An empty text on success. Otherwise, the error of the stage, or a text saying that the
-            stage did not reply within `timeout_s` seconds.
+            An empty string on success, otherwise the error message. No reply within `timeout_s`
+            counts as an error.
         """
         order = StageCommand(1 + secrets.randbits(62), what, stage, *generation)
         report = self._reports[order.number] = self._loop.create_future()

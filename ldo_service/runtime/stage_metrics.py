@@ -23,7 +23,7 @@ FAILING_AFTER = 3
 
 @dataclass
 class StageMetrics:
-    """Counters and step times of a stage; fields ending in `_at_s` are monotonic clock times."""
+    """Counters and step times of a stage; fields ending in `_at_s` are monotonic times, seconds."""
 
     heartbeat: Heartbeat | None = None  # Heartbeat of this process, if a parent process reads it.
     state: Literal["starting", "ready", "draining"] = "starting"
@@ -46,7 +46,7 @@ class StageMetrics:
 
     @contextmanager
     def step(self) -> Iterator[None]:
-        """Measure the duration of the step in the block, unless the step raises an exception."""
+        """Measure the duration of the step that runs in the `with` block, unless it raises."""
         started_s = self.started_at_s = self.clock.now_s()
         if self.heartbeat is not None:
             self.heartbeat.begin()
@@ -63,8 +63,8 @@ class StageMetrics:
 
         Args:
             message: Input of the step.
-            is_timed: Whether to add the duration of the step to `step_ms`. Steps that only store
-                their input are not added, because they would lower the percentiles.
+            is_timed: Whether to add the duration of the step to `step_ms`. It is False for a step
+                that only stores its input, because such short steps would lower the percentiles.
         """
         self.steps += 1
         self.dead_lettered_in_a_row = 0
@@ -85,7 +85,11 @@ class StageMetrics:
         return 0.0 if started_s is None else max(self.clock.now_s() - started_s, 0.0)
 
     def health(self, **of_the_stage: Any) -> Health:
-        """Return the health message; `of_the_stage` has the fields that only the stage knows."""
+        """Return the health message of the stage.
+
+        Args:
+            **of_the_stage: Fields of the message that this object does not have.
+        """
         median_ms, slow_ms = np.percentile(self.step_ms or [0.0], (50, 95)).tolist()
         facts, available_mb = self.facts, available_memory_mb()
         if available_mb is not None:

@@ -31,21 +31,20 @@ SAVE_AGAIN_S = 0.5
 
 
 class UnsavedStateError(Exception):
-    """Error that ends a stage with an unsaved state; a restart repeats the last step."""
+    """Error that ends a stage whose last step is not saved; a restarted stage repeats the step."""
 
 
 class StateSaver:
     """Saver of the state of one stage.
 
-    While the disk is full, the saver retries and the stage takes no messages. Two kinds of stages
-    without lossless inputs continue:
+    While the disk is full, the saver retries, and the stage takes no messages. Two kinds of stages
+    take messages nevertheless. Both have no lossless input:
 
-    - A stage with a nonblocking output (`Out.is_nonblocking`). Messages for required consumers wait
-      until the state of the stage is saved. While they wait, `Actor.has_credit` is False for their
-      topics.
+    - A stage with a nonblocking output (`Out.is_nonblocking`). It holds its messages for required
+      consumers until its state is saved. Meanwhile, `Actor.has_credit` is False for their topics.
     - A stage whose outputs have no required consumer.
 
-    A stage that is about to end does not wait for the disk.
+    A stage that is about to end does not wait for space on the disk.
     """
 
     def __init__(
@@ -83,8 +82,8 @@ class StateSaver:
     def save_initial(self, actor: Actor) -> None:
         """Save the initial state before other actors connect.
 
-        The initial state is small, so this call blocks the event loop only briefly. If saving
-        fails, the stage retries before the first step.
+        The initial state is small, so this call blocks the event loop only briefly. If the state
+        cannot be written, the stage retries before the first step.
         """
         try:
             self._write(
@@ -105,13 +104,13 @@ class StateSaver:
 
         Args:
             actor: The actor of the stage.
-            delivery: The delivery of the current step, which counts as handled.
-            taken: Entry of the delivery in the write-ahead log; None unless `Actor.lags`.
-            whole: Use `Actor.checkpoint`, the complete state, instead of `Actor.snapshot`.
+            delivery: The message of the current step, which is saved as handled.
+            taken: Entry of this message in the write-ahead log; None unless `Actor.lags`.
+            whole: Save the complete state (`Actor.checkpoint`), not the result of `Actor.snapshot`.
 
         Returns:
-            True if the state is saved. False if the disk is full and the stage is one of those that
-            continue nevertheless; see `StateSaver`.
+            True if the state is saved. False if the disk is full and the stage takes messages
+            nevertheless; see `StateSaver`.
 
         Raises:
             UnsavedStateError: The stage is about to end and the state cannot be written.
@@ -129,7 +128,7 @@ class StateSaver:
         return True
 
     async def save_checkpoint(self, actor: Actor) -> None:
-        """Save a checkpoint on request, without retries.
+        """Save the complete state (`Actor.checkpoint`) once, without retries.
 
         Raises:
             OSError: The state cannot be written.
@@ -140,15 +139,16 @@ class StateSaver:
     async def keep(
         self, actor: Actor, order: StageCommand, report: Callable[[StageCommand, str], None]
     ) -> None:
-        """Keep the last saved state as a generation, and write it in the background.
+        """Copy the last saved state for a generation, and write the copy in the background.
 
-        A generation is a copy of all states, to which the service can fall back. Writing one takes
-        long on a slow disk. Meanwhile, no other generation is begun.
+        A generation has copies of the states of all actors, and the service can fall back to it.
+        The call fails while the copy for the previous generation is still being written.
 
         Args:
             actor: The actor of the stage.
             order: The command, with the number of the generation.
-            report: Function that is called once the generation is written, with an error or "".
+            report: Function that sends the reply to the command. It is called with the command and
+                an error message; the message is empty after the copy is written.
         """
         if self._syncing:
             report(order, "is still writing the previous generation")
@@ -188,7 +188,7 @@ class StateSaver:
             report(order, "")
 
     def close(self) -> None:
-        """Cancel the writing that `keep` began; the service gets no reply to its command."""
+        """Cancel the writing that `keep` began; the service gets no reply to the command `keep`."""
         for task in self._syncing:
             task.cancel()
 

@@ -31,12 +31,13 @@ def produce(actor: Actor, messages: Iterable[Message]) -> list[Produced]:
     """Check and encode the outputs of a step.
 
     Args:
-        actor: The actor, with the flow status of the step.
+        actor: The actor; its `situation` has the credit of each nonblocking output.
         messages: The outputs that the actor's handler yields.
 
     Raises:
-        TypeError: A message belongs to none of the actor's outputs.
-        RuntimeError: The actor produced more messages than its credit on a nonblocking output.
+        TypeError: The type of a message belongs to none of the actor's outputs.
+        RuntimeError: The actor produced more messages on a nonblocking output than its credit
+            allows.
     """
     topics = {out.topic.message: out.topic for out in actor.outputs}
     credits = dict(actor.situation.credits)
@@ -62,7 +63,7 @@ def produce(actor: Actor, messages: Iterable[Message]) -> list[Produced]:
 class MessageDecoder:
     """Decoder of an actor's inputs.
 
-    It logs only the first of several consecutive malformed messages of a topic.
+    If several consecutive messages of a topic are malformed, the decoder logs only the first one.
     """
 
     def __init__(self, actor: str) -> None:
@@ -70,7 +71,7 @@ class MessageDecoder:
         self._rejecting: set[Topic] = set()  # Topics whose last message was malformed.
 
     def message_of(self, delivery: Delivery) -> Message | None:
-        """Decode a delivery; return None if it is malformed."""
+        """Return the decoded message of a delivery, or None if the message is malformed."""
         topic, header = delivery.port.topic, delivery.header
         try:
             message = decode(delivery.body, topic.message)

@@ -1,9 +1,9 @@
 """Supervision of all stages of a process in one task group, and the watchdog of systemd.
 
-An error that a stage cannot recover from ends all stages. `Watchdog` uses the protocol of
-sd_notify(3): it sends datagrams with one word to the socket in NOTIFY_SOCKET. If the unit of the
-service sets `WatchdogSec=`, systemd restarts the service when its event loop is blocked for that
-time.
+If a stage cannot recover from an error, all stages end. `Watchdog` uses the protocol of
+sd_notify(3): it sends short text datagrams to the socket that the variable NOTIFY_SOCKET names. The
+systemd unit of the service may set a time by `WatchdogSec=`. If the event loop is blocked for this
+time, systemd restarts the service.
 """
 
 import asyncio
@@ -34,7 +34,7 @@ PINGS_PER_PERIOD = 3
 
 
 class Runner(Protocol):
-    """Stage in this process, or the child process of a stage."""
+    """Interface of a stage that runs in this process or in a child process."""
 
     name: str
 
@@ -48,14 +48,14 @@ class Runner(Protocol):
 class StopRequest:
     """Stop request: soft after the first call of `request`, hard after the second.
 
-    On a soft stop each stage handles its queued messages. A hard stop cancels the stages.
+    On a soft stop, each stage handles its queued messages and ends. A hard stop cancels the stages.
     """
 
     def __init__(self) -> None:
         self._soft, self._hard = asyncio.Event(), asyncio.Event()
 
     def request(self) -> None:
-        """Request a soft stop, or a hard stop if a soft one is requested already."""
+        """Request a soft stop, or a hard stop if a soft stop is already requested."""
         (self._hard if self._soft.is_set() else self._soft).set()
 
     @property
@@ -73,10 +73,14 @@ class StopRequest:
 
 
 async def wait_until_quiet(runners: Sequence[Runner], timeout_s: float) -> None:
-    """Wait until no runner has had a queued message or a running step for `QUIET_S`.
+    """Wait until all runners have been idle for `QUIET_S` seconds, or until `timeout_s` has passed.
 
-    By then, all messages that result from the last input have reached their actors. The function
-    waits for at most `timeout_s` seconds.
+    A runner is idle if it has no queued message and no running step. After `QUIET_S` seconds, no
+    message is on its way between two runners.
+
+    Args:
+        runners: Stages and child processes.
+        timeout_s: Maximum time to wait, seconds.
     """
     loop = asyncio.get_running_loop()
     until_s, quiet_since_s = loop.time() + timeout_s, loop.time()
@@ -95,11 +99,12 @@ async def supervise(
     Args:
         runners: Stages and child processes, producers first.
         stop: The stop request.
-        sources: Number of runners at the start of `runners` that get inputs from outside the
-            service. After these sources have ended, the other runners have `drain_s` seconds to
-            handle all messages that result from the last outputs of the sources.
+        sources: Number of sources: runners that get their inputs from outside the service. They
+            come first in `runners` and end first. The other runners then have up to `drain_s`
+            seconds to handle the last outputs of the sources and all messages that follow.
         drain_s: Time that each runner has for a soft stop before it is cancelled, seconds. All
-            together have `ALL_DRAIN * drain_s`; after that, each one has `MIN_DRAIN * drain_s`.
+            runners together have `ALL_DRAIN * drain_s` seconds. After this time, each remaining
+            runner has `MIN_DRAIN * drain_s` seconds.
 
     Raises:
         RestartsExhausted: An actor has used up its restart budget.
@@ -161,7 +166,7 @@ class Watchdog:
         self.period_s = int(period) * 1e-6 if period.isdecimal() else 0.0  # 0: no watchdog.
 
     def notify(self, word: str) -> None:
-        """Send a word of sd_notify(3), for example "READY=1"."""
+        """Send a notification of the sd_notify(3) protocol, for example "READY=1"."""
         if not self._address:
             return
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify, suppress(OSError):

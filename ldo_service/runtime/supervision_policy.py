@@ -1,4 +1,4 @@
-"""Limits of supervision: step timeouts, restart budgets, back-off and repeated log lines."""
+"""Limits of supervision: step timeouts, restart budgets, restart delays and log rate limits."""
 
 import time
 from collections import deque
@@ -11,16 +11,16 @@ from ldo_service.errors import ConfigError, RestartsExhausted, named
 def monotonic_s() -> float:
     """Return the time of the monotonic clock, seconds.
 
-    Defaults name this function instead of `time.monotonic`, so that a simulation can replace the
-    clock.
+    The runtime uses this function instead of `time.monotonic`, so that a simulation can replace
+    the clock.
     """
     return time.monotonic()
 
 
 class RestartBudget:
-    """Restart budget of an actor: at most `max_restarts` within `window_s`.
+    """Restart budget of an actor: at most `max_restarts` restarts within `window_s` seconds.
 
-    The delay before a restart doubles with each failure in the window.
+    The delay before a restart doubles with each failure in these `window_s` seconds.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class RestartBudget:
 
 
 class LogLimit:
-    """Limit of a log line that outside input can cause: one line per period.
+    """Rate limit for a log line that messages from outside can cause: one line per period.
 
     Args:
         period_s: Minimum time between two lines, seconds.
@@ -81,7 +81,7 @@ class LogLimit:
         self._due_at_s = float("-inf")
 
     def is_due(self) -> bool:
-        """Return True at most once per period; the caller then writes its log line."""
+        """Return True at most once per period; on True, the caller writes its log line."""
         now_s = self._clock()
         if now_s < self._due_at_s:
             return False
@@ -93,8 +93,8 @@ class RunningClock:
     """Monotonic clock that stands still while this process does not run.
 
     A process does not run while it is suspended (SIGSTOP), while its container is paused, or while
-    its virtual machine is moved. Such a pause must not count as a hanging step. `tick` is called
-    periodically, so a late call shows that there was a pause.
+    its virtual machine is migrated. Such a pause must not make a step look as if it hangs. `tick`
+    is called periodically; a late call shows that the process was paused.
     """
 
     # Delay of a call of `tick`, in seconds, above which the process was paused. A busy machine
@@ -110,7 +110,7 @@ class RunningClock:
         """Record that the process runs; call this method every `period_s` seconds.
 
         Returns:
-            How long the process was paused since the last call, seconds; usually 0.
+            Time for which the process was paused since the last call, seconds; usually 0.
         """
         now_s = self._clock()
         late_s = 0.0 if self._last_s is None else now_s - self._last_s - period_s
@@ -121,7 +121,7 @@ class RunningClock:
         return late_s
 
     def now_s(self) -> float:
-        """Return the time in seconds; only differences have a meaning."""
+        """Return the time in seconds; only the difference of two results has a meaning."""
         return self._clock() - self._stopped_s
 
 
@@ -183,7 +183,11 @@ class SupervisionConfig:
             raise ConfigError(f"supervision.background_nice={self.nice} must be within 0..19.")
 
     def step_limit(self, is_backend: bool) -> tuple[float, str]:
-        """Return the maximum duration of a step in seconds, and the name of its setting."""
+        """Return the maximum duration of a step in seconds, and the name of its setting.
+
+        Args:
+            is_backend: Whether no other actor waits for the outputs of the step's actor.
+        """
         if is_backend:
             return self.backend_stall_after_s, "supervision.backend_step_timeout_s"
         return self.stall_after_s, "supervision.step_timeout_s"

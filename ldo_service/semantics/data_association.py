@@ -1,16 +1,17 @@
 """Data association between the regions of a keyframe and objects (LDO-SLAM paper, III.C).
 
-An object landmark has a sample of Gaussians, called its members. The predicted box of a landmark
-encloses the members that are not occluded according to the measured depth. It estimates the box
-that a detector would draw around the visible part of the object. A landmark and a region may be the
-same object if
+Each object is a landmark: a sample of its Gaussians, called members, with their label distribution.
+The predicted box of a landmark encloses the members that are not occluded according to the measured
+depth. A detector should find the object in about this box. A landmark and a region may be the same
+object if
 
     the IoU of their boxes is at least 0.4,
     the common mass of their label distributions is at least 0.3,
     and the gap between their depth ranges is at most 0.1 m.
 
-Of all one-to-one assignments of such pairs, the one with the largest sum of IoU is used. Before the
-assignment, a region that shows only a part of another region's object is merged into that region.
+Each landmark is matched with at most one such region, and each region with at most one landmark.
+The sum of the IoUs of all matched pairs is the largest possible. Before the matching, a region that
+shows only a part of an object is merged into the region that shows the whole object.
 """
 
 from dataclasses import dataclass, replace
@@ -36,17 +37,17 @@ class MapView:
     Attributes:
         keyframe: Id of the keyframe.
         camera: Intrinsics of the keyframe.
-        T_map_camera: Pose of the camera, [4, 4].
-        rows: Gaussians of the map, [N, 16].
+        T_map_camera: Transform from the camera to the map, [4, 4].
+        rows: Gaussians of the map, [N, 16], see `gaussians.rows`.
         labels: Label rows of the Gaussians, [N, 32] uint8, see `gaussian_labels.ROW`.
         ids: Ids of the Gaussians, [N] int64, ascending.
-        anchors: Anchor keyframes of the Gaussians, [N] int32.
-        indices: Rows of the Gaussians that contribute to the image, [V] uint32, ascending.
+        anchors: Ids of the keyframes that the Gaussians move with, [N] int32.
+        indices: Row numbers of the Gaussians visible in the image, [V] uint32, ascending.
         regions: Region of each Gaussian in `indices`, [V] int32; negative if the Gaussian is in no
             region. See `Assignment`.
         boxes: Boxes of the regions, [M, 4], x0 y0 x1 y1, pixels.
-        classes: Labels by the detector and by the labeller, [M, 2]; -1 if missing.
-        depth_m: Depth of the keyframe, [H, W] float32, meters.
+        classes: Labels of each region by the detector and the labeller, [M, 2]; -1 if missing.
+        depth_m: Measured depth of the keyframe, [H, W] float32, meters; 0 where unknown.
     """
 
     keyframe: int
@@ -70,12 +71,13 @@ class MapView:
             )
         if len(self.regions) != v or (v and not self.indices[-1] < n):
             raise ValueError(
-                f"regions has {len(self.regions)} entries for {v} Gaussians: it must have one for "
-                f"each. Indices of Gaussians must be below {n}, the number of rows of the map."
+                f"regions has {len(self.regions)} entries, must have {v}, one for each of indices. "
+                f"The values of indices must be below {n}, the number of Gaussians in the map."
             )
         if v and self.regions.max() >= len(self.boxes):
             raise ValueError(
-                f"region {self.regions.max()} must be below {len(self.boxes)}, the number of boxes."
+                f"regions has the value {self.regions.max()}; all values must be below "
+                f"{len(self.boxes)}, the number of boxes."
             )
         if len(self.classes) != len(self.boxes):
             raise ValueError(
@@ -98,10 +100,10 @@ class RegionStatistics:
         boxes: Boxes of the regions, [R, 4], pixels.
         members: Ids of a sample of the Gaussians of each region, [R, 256], in the order that the
             function `shuffled` defines. Unused entries at the end are NO_MEMBER.
-        p_map: Positions of these Gaussians in the map frame, [R, 256, 3], meters.
-        distributions: Means of their label distributions, [R, C], weighted by opacity.
+        p_map: Positions of the Gaussians in `members` in the map frame, [R, 256, 3], meters.
+        distributions: Mean label distribution of these Gaussians, weighted by opacity, [R, C].
         near_m: Near end of the depth range of these Gaussians, [R], meters.
-        far_m: Far end of the depth range, [R], meters.
+        far_m: Far end of the depth range of these Gaussians, [R], meters.
     """
 
     numbers: np.ndarray
@@ -118,8 +120,8 @@ def compute_region_statistics(
 ) -> RegionStatistics:
     """Compute the statistics of the regions of a keyframe.
 
-    Regions with fewer than min_gaussians Gaussians are left out. If more than max_regions remain,
-    those with the most Gaussians are used.
+    Regions with fewer than `config.min_gaussians` Gaussians are ignored. Of the others, at most
+    `config.max_regions` are used: those with the most Gaussians.
     """
     hit = np.flatnonzero(view.regions >= 0)
     counts = np.bincount(view.regions[hit], minlength=len(view.boxes))
@@ -143,10 +145,10 @@ def compute_region_statistics(
 
 
 def merge_parts(view: MapView, regions: RegionStatistics, config: AssociationConfig) -> MapView:
-    """Return the view after merging each region into the region that contains it, if there is one.
+    """Return the view in which each region that lies within another one is merged into that region.
 
-    The Gaussians of a merged region belong to the containing region. `find_containing_regions`
-    defines which region contains another one.
+    The Gaussians of a merged region then belong to the region that contains it. The function
+    `find_containing_regions` finds this region.
     """
     near_m = np.full(len(view.boxes), np.inf)
     far_m = -near_m
@@ -187,8 +189,8 @@ def find_containing_regions(
 
     Region a contains region b if three conditions hold: the regions share a class; the gap between
     their depth ranges is at most max_depth_gap_m; and a has the larger box, which covers at least
-    the fraction part_inside of the box of b. If all Gaussians of a region were assigned to smaller
-    regions inside it, the region gets the depth range of the largest of these smaller regions.
+    the fraction part_inside of the box of b. A region whose depth range is unknown gets the depth
+    range of the largest region inside it.
 
     Args:
         boxes: Boxes of the regions, [M, 4], x0 y0 x1 y1, pixels.
@@ -198,8 +200,8 @@ def find_containing_regions(
         config: Settings of the data association.
 
     Returns:
-        Number of the containing region, [M]: the largest if there are several, and the region's own
-        number if there is none. A part of a part gets the number of the whole.
+        For each region, the number of the largest region that contains it, [M]; its own number if
+        there is none. If a contains b and b contains c, c gets the number of a.
 
     >>> plant, crown, pot = [0, 0, 9, 20], [0, 0, 9, 12], [2, 12, 7, 20]
     >>> at_m = np.full(3, 2.0)
@@ -262,16 +264,16 @@ def _sampled(view: MapView, hit: np.ndarray, counts: np.ndarray, numbers: np.nda
 class PredictedBoxes:
     """Predicted boxes and visibility of K landmarks in a keyframe.
 
-    Each landmark has members: a sample of its Gaussians. Reliable members are those with enough
-    votes, see `reliable_members`.
+    Each landmark has members: a sample of its Gaussians. Only the reliable ones are projected; see
+    `reliable_members`.
 
     Attributes:
         boxes: Boxes of the visible members, [K, 4], x0 y0 x1 y1, pixels. If no member is visible,
             the box encloses the members in front of the measured depth. If all members are
             occluded or out of view, the box is empty (x0 > x1).
-        shown: Fraction of the reliable members that are visible, [K]: the measured depth at their
+        shown: Fraction of the projected members that are visible, [K]: the measured depth at their
             pixel is in the landmark's depth range.
-        through: Fraction of the reliable members whose surface is gone, [K]: the measured depth at
+        through: Fraction of the projected members whose surface is gone, [K]: the measured depth at
             their pixel is behind the landmark's depth range.
         near_m: Near end of the members' depth range, [K], meters.
         far_m: Far end of the members' depth range, [K], meters.
@@ -291,9 +293,9 @@ def predict_boxes(
 ) -> PredictedBoxes:
     """Predict boxes and visibility of landmarks in a keyframe.
 
-    A landmark is projected as a sample of its Gaussians, called its members. Members are used if
-    they have enough votes (see `reliable_members`) and are in memory rather than on disk. If a
-    landmark has no such member, its centroid is projected instead.
+    Each landmark has a sample of its Gaussians, called members. The function projects the members
+    that are reliable (see `reliable_members`) and in memory rather than on disk. If a landmark has
+    no such member, the function projects its centroid.
 
     Args:
         table: Landmarks, [K] records of `LANDMARK`.
@@ -343,7 +345,7 @@ def _measured(p_camera: np.ndarray, view: MapView) -> tuple[np.ndarray, np.ndarr
 def depth_gaps_m(
     near_m: np.ndarray, far_m: np.ndarray, others_near_m: np.ndarray, others_far_m: np.ndarray
 ) -> np.ndarray:
-    """Return the gaps between K depth ranges and R other ones, [K, R]; negative if they overlap."""
+    """Return the gaps between K and R depth ranges, [K, R], meters; negative for an overlap."""
     return np.maximum(near_m[:, None], others_near_m) - np.minimum(far_m[:, None], others_far_m)
 
 
@@ -352,7 +354,7 @@ class AssociationCosts:
     """Pairwise measures for the association of K landmarks with R regions.
 
     Attributes:
-        iou: IoU of predicted box and region box, [K, R].
+        iou: IoU of each landmark's predicted box with each region's box, [K, R].
         allowed: Pairs that may be the same object, [K, R] bool: their boxes overlap, the gap
             between their depth ranges is at most max_depth_gap_m, and the common mass of their
             label distributions is at least min_shared.
@@ -368,7 +370,7 @@ def association_costs(
     regions: RegionStatistics,
     config: AssociationConfig,
 ) -> AssociationCosts:
-    """Compute the association costs of K landmarks, with distributions [K, C], and R regions."""
+    """Compute the association costs of K landmarks, with label distributions, and R regions."""
     iou = ious(predicted.boxes, regions.boxes)
     gap_m = depth_gaps_m(predicted.near_m, predicted.far_m, regions.near_m, regions.far_m)
     allowed = (iou > 0) & (gap_m <= config.max_depth_gap_m)
@@ -380,17 +382,17 @@ def association_costs(
 def associate(
     iou: np.ndarray, allowed: np.ndarray, min_iou: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Match rows of `iou` with columns so that the sum of the matched values is largest.
+    """Match K landmarks with R regions so that the sum of the IoUs of matched pairs is largest.
 
-    Each row and each column is matched at most once. The result is deterministic.
+    Each landmark and each region is matched at most once. The result is deterministic.
 
     Args:
         iou: IoU of each pair, [K, R].
         allowed: Pairs that may be matched, [K, R] bool.
-        min_iou: Minimum IoU of a pair.
+        min_iou: Minimum IoU of a matched pair.
 
     Returns:
-        Matched rows, in ascending order, and the column of each.
+        Numbers of the matched landmarks, ascending, and the number of the region of each.
     """
     gain = np.where(allowed & (iou >= min_iou), iou, 0)
     k, r = linear_sum_assignment(gain, maximize=True)

@@ -1,7 +1,7 @@
-"""Copy of the labels and objects of a map, which waits for label results.
+"""Copy of the labels and objects of a map that waits for the results of the labeller.
 
-The copy processes each keyframe after the map, as soon as the results of all earlier label requests
-have arrived; see `ordered_semantics`.
+The map processes a keyframe at once. The copy processes the same keyframe later: after the results
+of all earlier label requests have arrived. See `ordered_semantics`.
 """
 
 import hashlib
@@ -24,16 +24,16 @@ from .semantic_map import SemanticMap
 
 @dataclass(eq=False, slots=True)
 class DelayedCopy:
-    """Copy of a map's labels and objects, which processes each keyframe later than the map.
+    """Copy of the labels and objects of a map that processes each keyframe later than the map.
 
-    It waits until the results of all earlier label requests to the labeller have arrived.
+    The copy processes a keyframe after the results of all earlier label requests have arrived.
 
     Attributes:
         semantics: The copied semantics except the labels of the Gaussians.
         labels: The copied labels of the Gaussians.
-        first_object: First id of the objects that were created after the copy was made.
-        results_due: Regions whose label results come before the next keyframe, in order.
-        keyframes: Detections of the keyframes to process, in order.
+        first_object: Minimum id of objects that were created after the copy was made.
+        results_due: Regions whose label results must be applied before the next keyframe, in order.
+        keyframes: Detections of the keyframes to process, by keyframe id, in order.
     """
 
     semantics: SemanticMap
@@ -51,13 +51,15 @@ class DelayedCopy:
         return [region.keyframe, *naming.shown_in(region.id)]
 
     def step(self, results: Mapping[bytes, RegionLabelResult]) -> list[Region]:
-        """Apply one label result or process one keyframe, unless label results are missing.
+        """Apply the next label result or process the next keyframe.
+
+        The method does nothing while a label result that it needs has not arrived.
 
         Args:
             results: Label results that have arrived, by `request_key` of their requests.
 
         Returns:
-            Regions whose label results must arrive before the next call.
+            Regions whose label results have not arrived but are needed by the next call.
         """
         missing = [one for one in self.results_due if request_key(one) not in results]
         if missing:
@@ -85,11 +87,11 @@ class DelayedCopy:
 
     @staticmethod
     def restored(state: Mapping[str, Any], semantics: SemanticMap) -> "DelayedCopy":
-        """Return the `DelayedCopy` whose state `snapshot` returned.
+        """Return a `DelayedCopy` with the state that `snapshot` returned.
 
         Args:
             state: The result of `snapshot`.
-            semantics: Semantics that have already been restored.
+            semantics: Semantics of the copy, already restored from `state["semantics"]`.
         """
         keyframes = {
             keyframe: RegionDetections(*arrays) if arrays else None
@@ -107,7 +109,7 @@ class GaussianLabels:
     Attributes:
         ids: Ids of the Gaussians, [N], ascending.
         labels: Label rows of the Gaussians, [N, 32] uint8, see `gaussian_labels.ROW`.
-        next_id: Lower bound of the ids of Gaussians that were created later.
+        next_id: Minimum id of Gaussians that were created after these labels were stored.
     """
 
     ids: np.ndarray
@@ -121,10 +123,11 @@ class GaussianLabels:
 
     @contextmanager
     def in_map(self, gaussians: GaussianMap) -> Iterator[None]:
-        """Replace the labels of a map by these labels until the context ends.
+        """Give a map these labels inside a `with` block.
 
-        At the end, changes of the labels are stored here and the map gets its own labels back. No
-        Gaussian may be added to the map, removed or loaded from disk in the meantime.
+        At the end of the block, this object stores the changed labels, and the map gets its own
+        labels back. The block must not add Gaussians to the map, remove them, or load them from
+        disk.
         """
         shown, ids = gaussians.labels.copy(), gaussians.ids.copy()
         gaussians.labels[:] = self._of(gaussians)
@@ -139,9 +142,9 @@ class GaussianLabels:
             gaussians.labels[:] = shown
 
     def write(self, gaussians: GaussianMap) -> np.ndarray:
-        """Write the labels into a map, and return the rows that changed.
+        """Write the labels into a map, and return the numbers of the changed rows.
 
-        Offloaded Gaussians keep the labels that they have on disk.
+        Gaussians that are on disk instead of in memory keep their labels.
         """
         labels = self._of(gaussians)
         changed = np.flatnonzero(np.any(labels != gaussians.labels, axis=1))
@@ -166,7 +169,7 @@ class GaussianLabels:
 
 
 def request_key(region: Region) -> bytes:
-    """Return a digest of the whole content of a label request except the id of the region."""
+    """Return a digest of all contents of a region's label request except the id of the region."""
     digest = hashlib.blake2b(digest_size=16)
     digest.update(repr((region.keyframe, region.box_px, region.label, region.score)).encode())
     for view in region.views:
@@ -175,16 +178,16 @@ def request_key(region: Region) -> bytes:
 
 
 def renumbered(objects: Objects, before: Objects, first_new: int) -> Objects:
-    """Return the objects of a `DelayedCopy` with the ids that the map already shows.
+    """Return the objects of a `DelayedCopy`, with the ids of the same objects in the map.
 
-    Objects that are new in the copy are matched with objects that are new in the map, so that the
-    matched objects have the most Gaussians in common. A matched object gets the id in the map;
-    another new object gets an unused id.
+    An object is new if it was created after the copy was made. New objects of the copy are matched
+    with new objects of the map, so that the matched pairs have the most Gaussians in common. A
+    matched object gets the id of its match in the map. Any other new object gets an unused id.
 
     Args:
         objects: Objects of the copy.
-        before: Objects that the map shows.
-        first_new: First id that was unused when the copy was made.
+        before: Objects of the map.
+        first_new: Minimum id of new objects.
     """
     packed, known = objects.pack(), before.pack()
     table = packed["landmarks"].view(LANDMARK)[:, 0]
@@ -204,18 +207,18 @@ def renumbered(objects: Objects, before: Objects, first_new: int) -> Objects:
 
 
 def next_id_of(objects: Objects) -> int:
-    """Return the id of the next new object."""
+    """Return the id that the next new object will get."""
     return int(objects.pack()["counts"][0])
 
 
 def common_members(members: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the numbers of common members of K and R landmarks, [K, R].
+    """Count the members that each of K landmarks has in common with each of R others, [K, R].
 
     The members of a landmark are a sample of its Gaussians.
 
     Args:
-        members: Ids of the members, [K, 256]; NO_MEMBER where unused.
-        others: The same, [R, 256].
+        members: Ids of the members of K landmarks, [K, 256]; NO_MEMBER where unused.
+        others: Ids of the members of R landmarks, [R, 256]; NO_MEMBER where unused.
     """
     shared = [
         [np.count_nonzero(np.isin(one[one != NO_MEMBER], other)) for other in others]

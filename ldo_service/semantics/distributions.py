@@ -1,7 +1,8 @@
-"""Distributions over the labels of a vocabulary: dense [..., C] with C = 256, or sparse.
+"""Probability distributions over the labels of a vocabulary, in dense or sparse form.
 
-Distributions are stored and published in sparse form: the eight heaviest labels. The mass of all
-other labels counts as `other`.
+A dense distribution has a probability for each of C = 256 labels, [..., C]. A sparse distribution
+has the eight labels of highest probability, and counts the rest of the probability as label
+`other`. Distributions are stored and published in sparse form.
 """
 
 import numpy as np
@@ -18,17 +19,18 @@ def mean_distributions(labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
         p_k = sum_m w_km p_km / sum_m w_km
 
-    See the landmarks in the LDO-SLAM paper, III.C.
+    Gaussian m of group k has the label distribution p_km and the weight w_km. The mean is the label
+    distribution of a landmark in the LDO-SLAM paper, III.C.
 
     Args:
-        labels: Label rows of the Gaussians, [K, M, 32] uint8.
-        weights: Weights of the Gaussians, [K, M]; 0 where a group has fewer than M.
+        labels: Label rows of the Gaussians, [K, M, 32] uint8, see `gaussian_labels.ROW`.
+        weights: Weights of the Gaussians, [K, M]; 0 where a group has fewer than M Gaussians.
 
     Returns:
-        The means. A group has all of its mass on background if its weights are all 0.
+        The means. If all weights of a group are 0, background has probability 1.
 
-    Example: the first Gaussian has weight 3, and all of its mass is on label 2. The second has
-    weight 1, and half of its mass is on label 2.
+    Example: one group of two Gaussians. The first has weight 3 and is certain to have label 2. The
+    second has weight 1, and label 2 has a probability of one half.
 
     >>> from ldo_service.semantics.gaussian_labels import new_labels
     >>> labels = new_labels(2)
@@ -47,7 +49,7 @@ def mean_distributions(labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def normalized(p: np.ndarray) -> np.ndarray:
-    """Scale rows to a sum of one; a row of zeros becomes a row with all mass on background."""
+    """Scale each row to a sum of one; in a row of zeros, background gets probability 1."""
     total = p.sum(axis=-1, keepdims=True)
     nothing = np.zeros(p.shape[-1])
     nothing[BACKGROUND] = 1
@@ -58,10 +60,9 @@ def sparse(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Convert dense distributions [..., C] to sparse ones.
 
     Returns:
-        The eight heaviest labels, [..., 8] uint8, and their weights, [..., 8] float32.
-
-    The heaviest label comes first; of labels with equal weight, the lower index comes first. If the
-    weights sum to less than one, the remaining mass belongs to `other`.
+        The eight labels of highest probability, [..., 8] uint8, and their probabilities, [..., 8]
+        float32. The highest comes first. Of equal ones, the label with the lower number comes
+        first. If they sum to less than one, the rest of the probability belongs to label `other`.
     """
     order = np.argsort(-p, axis=-1, kind="stable")[..., :KEPT]
     return order.astype(np.uint8), np.take_along_axis(p, order, axis=-1).astype(np.float32)
@@ -70,11 +71,11 @@ def sparse(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def dense(labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Convert sparse distributions to dense ones, [..., C] float64.
 
-    If the weights of a distribution sum to less than one, `other` gets the remaining mass.
+    If the probabilities of a distribution sum to less than one, label `other` gets the rest.
 
     Args:
         labels: Labels, [..., 8] uint8.
-        weights: Weights of the labels, [..., 8].
+        weights: Probabilities of the labels, [..., 8].
     """
     out = np.zeros((*labels.shape[:-1], MAX_LABELS))
     np.put_along_axis(out, labels.astype(np.int64), weights.astype(float), axis=-1)
@@ -83,9 +84,9 @@ def dense(labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def divergence(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return KL(p || q) = sum_c p_c log(p_c / q_c) in nats, [...].
+    """Return the divergences KL(p || q) = sum_c p_c log(p_c / q_c) in nats, [...].
 
-    p and q are dense distributions, [..., C]. q_c is clamped to at least 1e-6.
+    p and q are dense label distributions, [..., C]. Values of q_c below 1e-6 are set to 1e-6.
 
     >>> couch, both = np.array([0.0, 0.0, 1.0]), np.array([0.1, 0.1, 0.8])
     >>> round(float(divergence(couch, both)), 4)  # log(1 / 0.8)
@@ -98,22 +99,22 @@ def divergence(p: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def entropy(p: np.ndarray) -> np.ndarray:
-    """Return the entropies H = -sum_c p_c log p_c of dense distributions [..., C].
+    """Return the entropies H = -sum_c p_c log p_c of dense distributions p, [..., C].
 
-    The result has the shape [...] and the unit nat. See the LDO-SLAM paper, III.C.
+    The entropies are in nats, [...]. See the LDO-SLAM paper, III.C.
     """
     return -np.sum(p * np.log(np.where(p > 0, p, 1)), axis=-1)
 
 
 def common_mass(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the common mass of pairs of dense distributions [..., C], ignoring background.
+    """Return the common mass of pairs of dense distributions p and q, [..., C].
 
         mass = sum_c min(p_c, q_c) / min(sum_c p_c, sum_c q_c)
 
-    The sums are over all labels except background.
+    The sums are over all labels c except background.
 
     Returns:
-        The common mass, [...], 0..1; 0 if p or q has all of its mass on background.
+        The common mass, [...], 0..1; 0 if background has probability 1 in p or q.
     """
     p, q = p.copy(), q.copy()
     p[..., BACKGROUND] = q[..., BACKGROUND] = 0
@@ -123,9 +124,13 @@ def common_mass(p: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def names(p: np.ndarray) -> np.ndarray:
-    """Return the likeliest label except background of each distribution.
+    """Return the likeliest label of each distribution, apart from background.
 
-    The distributions p have the shape [..., C], the labels [...] uint8.
+    Args:
+        p: Dense distributions, [..., C].
+
+    Returns:
+        The labels, [...] uint8.
     """
     p = p.copy()
     p[..., BACKGROUND] = -1

@@ -1,4 +1,4 @@
-"""Label distributions of the Gaussians over time, and their smoothing among neighbors."""
+"""Label distributions of Gaussians: update by observations, and smoothing among neighbors."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -29,7 +29,7 @@ ROW = np.dtype(
 
 @dataclass(frozen=True, slots=True)
 class ConsistencyConfig:
-    """Settings of the label smoothing among neighbors."""
+    """Settings for smoothing the label distributions of neighboring Gaussians."""
 
     # Scale of the distance in the weight of a neighbor: sigma_cons (LDO-SLAM paper, III.A).
     sigma_m: float = 0.05
@@ -49,17 +49,17 @@ class ConsistencyConfig:
 
 @dataclass(frozen=True, slots=True)
 class Disagreement:
-    """Label disagreement of neighbors before the smoothing step, summed over the Gaussians.
+    """Label disagreement of neighbors before the smoothing step, summed over all Gaussians.
 
-    Gaussian i has the mean mu_i, the label distribution p_i, the likeliest label s_i and the
-    neighbors N_i. The weight of a neighbor j of i is
+    Gaussian i has the center mu_i, the label distribution p_i, the likeliest label s_i and the set
+    of neighbors N_i. The weight of a neighbor j of i is
 
-        k_ij = w_ij exp(-|mu_i - mu_j|^2 / sigma^2),  w_ij = 1 / |N_i|
+        k_ij = w_ij exp(-|mu_i - mu_j|^2 / sigma_m^2),  w_ij = 1 / |N_i|
 
     Attributes:
-        literal: sum_ij k_ij [s_i != s_j], as printed in the LDO-SLAM paper, III.A; it has no
+        literal: sum_ij k_ij [s_i != s_j], as in the LDO-SLAM paper, III.A. This sum has no
             gradient.
-        expected: sum_ij k_ij (1 - p_i . p_j), which the smoothing step reduces.
+        expected: sum_ij k_ij (1 - p_i . p_j). The smoothing step reduces this sum.
     """
 
     literal: float
@@ -80,17 +80,17 @@ def smooth_labels(
 
         p_i <- (1 - rate K_i) p_i + rate sum_j k_ij p_j,  K_i = sum_j k_ij
 
-    It follows the gradient of the expected disagreement, sum_j k_ij p_j, and its result is again a
-    distribution. All p on the right have their values before the step.
+    All p on the right are from before the step. The vector sum_j k_ij p_j is the negative gradient
+    of the expected disagreement. The new p_i is again a distribution.
 
-    Neighbors are Gaussians in `indices` within radius_m. They are chosen from at most sixteen
-    candidates in voxels with a side of 2 sigma_m: at most eight Gaussians from the same voxel, and
-    the others from the surrounding voxels. The result is bitwise equal for any number of threads.
+    Neighbors are Gaussians in `indices` at a distance of at most radius_m. Each Gaussian has at
+    most sixteen candidates: up to eight from its own voxel, and the others from the surrounding
+    voxels. A voxel has a side of 2 sigma_m. The result is bitwise equal for any number of threads.
 
     Args:
-        rows: Gaussians of the map, [N, 16].
+        rows: Gaussians of the map, [N, 16], see `gaussians.rows`.
         labels: Label rows of the Gaussians, [N, 32] uint8, see `ROW`.
-        indices: Rows to smooth, [V] uint32, ascending.
+        indices: Numbers of the rows to smooth, [V] uint32, ascending.
         config: Settings of the smoothing.
         threads: Number of threads.
 
@@ -98,10 +98,10 @@ def smooth_labels(
         The disagreement before the step.
 
     Raises:
-        ValueError: If the shapes or types of the arrays do not fit.
+        ValueError: An array has a wrong shape or type.
 
-    Example: two Gaussians are 5 cm apart. One is a chair (label 2), the other is background.
-    k = exp(-1), and the step moves a probability of 0.1 k = 0.037.
+    Example: two Gaussians are 5 cm apart. One is a chair (label 2), the other is background. With
+    sigma_m = 0.05, k is exp(-1). With rate = 0.1, the step moves a probability of 0.1 k = 0.037.
 
     >>> from .gaussian_labels import distribution, fields, new_labels
     >>> rows, labels = np.zeros((2, 16), np.float32), new_labels(2)
@@ -121,9 +121,9 @@ def smooth_labels(
 class LabelConfig:
     """Settings of the label update with each observation.
 
-    The constants of the rule `corrected` were chosen on frames from one floor of a Replica
-    apartment, with voxels in place of Gaussians. usual_extent_m and hold_back were chosen on the
-    same frames with two detectors.
+    The constants of the rule `corrected` were tuned on frames from one floor of a Replica
+    apartment, with voxels in place of Gaussians. usual_extent_m and hold_back were tuned on the
+    same frames, with the detections of two detectors.
     """
 
     ema: Literal["paper", "corrected"] = "corrected"  # Rule of the update; see `observe`.
@@ -163,12 +163,12 @@ class Observations:
     """Observations of V Gaussians in a keyframe.
 
     Attributes:
-        indices: Rows of the Gaussians, [V] uint32, ascending.
-        labels: Observed labels, [V] int16. MISS: the Gaussian is visible, but in no region.
-            NOT_SEEN: nothing was observed.
+        indices: Row numbers of the Gaussians in the map, [V] uint32, ascending.
+        labels: Observed labels, [V] int16. The value MISS means that the Gaussian is visible, but
+            in no region. NOT_SEEN means that nothing was observed.
         confidences: Confidences of the labels, [V] float32, 0..1.
-        extents_m: Size of the labelled object, [V] float32, meters. For a miss, the minimum size
-            that an object must have for the miss to count.
+        extents_m: Size of the object with the observed label, [V] float32, meters. For a miss, this
+            is the minimum size of objects for which the miss counts.
     """
 
     indices: np.ndarray
@@ -178,35 +178,37 @@ class Observations:
 
 
 def fields(labels: np.ndarray) -> np.ndarray:
-    """Return a view of label rows [N, 32] as records [N] of `ROW`; no data is copied."""
+    """Return label rows, [N, 32] uint8, as an array view of N records of type `ROW`."""
     return labels.view(ROW)[:, 0]
 
 
 def observe(
     labels: np.ndarray, seen: Observations, config: LabelConfig, *, threads: int = 1
 ) -> None:
-    """Update label rows [N, 32] by the observations of a keyframe, in place.
+    """Update label rows, [N, 32] uint8, in place by the observations of a keyframe.
 
-    An observed label s changes the distribution to p <- (1 - a) p + a onehot(s). The setting `ema`
-    selects how a is computed. With `paper`, a = 1 - keep; seven observations then change the label
-    if keep = 0.9. Misses are counted, and miss_limit misses in a row turn a Gaussian into
-    background.
+    Each Gaussian has a label distribution p. An observation of label s changes p to
 
-    With `corrected`, p is the weighted mean of all observations, and the weights decay with age. An
-    observation has the weight w = confidence. W is the sum of the decayed weights: W <- keep W + w
-    and a = w / W, so that the first observation has a = 1. A miss is an observation of background
-    with w = miss_weight. A miss counts only if the object would appear at least min_px large. The
-    size of the object was stored at the last observation of a label; before the first observation,
-    it is usual_extent_m.
+        p <- (1 - a) p + a onehot(s)
 
-    An observation with low confidence changes a Gaussian less if the entropy H of p (nats) is low:
-    the factor 1 - hold_back exp(-2 H) (1 - confidence) multiplies a with `paper` and w with
-    `corrected`. It is applied only if p has a label other than background.
+    The setting `ema` selects the rule for the step size a:
+
+    - `paper`: a = 1 - keep. With keep = 0.9, seven observations in a row change the likeliest
+      label. After miss_limit misses in a row, the Gaussian becomes background.
+    - `corrected`: a = w / W. The weight w of an observation is its confidence. W is the sum of all
+      weights, which decay with age: W <- keep W + w. The first observation thus has a = 1. A miss
+      is an observation of background with w = miss_weight. It counts only if the Gaussian's object
+      would appear at least min_px large. The size of the object is from the last observation of a
+      label; before the first one, it is usual_extent_m.
+
+    Observations with low confidence have less effect on Gaussians whose p has a low entropy H
+    (nats). For this, a (rule `paper`) or w (rule `corrected`) is multiplied by the factor
+    1 - hold_back exp(-2 H) (1 - confidence). The factor is 1 while p is background only.
 
     The result is bitwise equal for any number of threads. See the LDO-SLAM paper, III.A.
 
     Raises:
-        ValueError: If the shapes or types of the arrays do not fit.
+        ValueError: An array has a wrong shape or type.
 
     >>> labels, config = new_labels(1), LabelConfig(hold_back=0)
     >>> def see(label, confidence, config):
@@ -247,10 +249,10 @@ def observe(
 
 
 def clear_background(labels: np.ndarray, indices: np.ndarray) -> None:
-    """Remove the weight of background from rows `indices` [V] of labels [N, 32], in place.
+    """Set the probability of background to zero in rows `indices` [V] of labels [N, 32], in place.
 
-    The weights of the other labels are scaled to a sum of one. The evidence is multiplied by their
-    sum before the scaling.
+    The other probabilities are scaled to a sum of one. The field `evidence` is multiplied by the
+    sum that they had before.
 
     >>> labels = new_labels(1)
     >>> row = fields(labels)
@@ -267,17 +269,17 @@ def clear_background(labels: np.ndarray, indices: np.ndarray) -> None:
 
 
 def reset_labels(labels: np.ndarray, indices: np.ndarray) -> None:
-    """Reset rows `indices` [V] of labels [N, 32] in place, as if they were never observed."""
+    """Clear rows `indices` [V] of labels [N, 32], in place, to the state before any observation."""
     labels[indices] = 0
 
 
 def background(labels: np.ndarray) -> np.ndarray:
-    """Return the probability of background in label rows [N, 32], [N] float32."""
+    """Return the probability of background, [N] float32, in each of N label rows, [N, 32]."""
     return np.maximum(1 - fields(labels)["weights"].sum(axis=1), 0)
 
 
 def top_labels(labels: np.ndarray) -> np.ndarray:
-    """Return the likeliest label of each label row [N, 32], [N] uint8.
+    """Return the likeliest label, [N] uint8, of each of N label rows, [N, 32].
 
     If background is as likely as the likeliest other label, the result is background.
     """
@@ -286,23 +288,23 @@ def top_labels(labels: np.ndarray) -> np.ndarray:
 
 
 def distribution(labels: np.ndarray, classes: int = MAX_LABELS) -> np.ndarray:
-    """Convert label rows [N, 32] to dense distributions.
+    """Convert label rows to dense distributions, which have a probability for each label.
 
     Args:
-        labels: Label rows.
-        classes: Number of labels of the result.
+        labels: Label rows, [N, 32] uint8.
+        classes: Number of labels of each distribution.
 
     Returns:
         The distributions, [N, classes] float32; each row sums to one.
 
     Raises:
-        ValueError: If a label is not below `classes`.
+        ValueError: A label number is not below `classes`.
     """
     rows = fields(labels)
     used = rows["weights"] > 0
     if np.any(rows["ids"][used] >= classes):
         raise ValueError(
-            f"label {rows['ids'][used].max()} must be below {classes}, the number of classes."
+            f"label number {rows['ids'][used].max()} must be below {classes}, the value of classes."
         )
     out = np.zeros((len(labels), classes), np.float32)
     out[:, BACKGROUND] = background(labels)
@@ -312,7 +314,7 @@ def distribution(labels: np.ndarray, classes: int = MAX_LABELS) -> np.ndarray:
 
 
 def entropy(labels: np.ndarray) -> np.ndarray:
-    """Return the entropies H = -sum p log p of N label rows [N, 32], in nats.
+    """Return the entropy H = -sum p log p of each of N label rows, [N, 32], in nats, [N].
 
     >>> labels = new_labels(1)
     >>> fields(labels)["weights"][0, 0] = 0.5

@@ -1,6 +1,7 @@
 """Assignment of Gaussians to the regions of a keyframe (LDO-SLAM paper, III.A).
 
-The kernel is `kernels/assignment.hpp`; `tests/reference/assignment.py` implements it in NumPy.
+The C++ implementation is `kernels/assignment.hpp`. The tests compare it with the NumPy
+implementation `tests/reference/assignment.py`.
 """
 
 from collections.abc import Sequence
@@ -55,11 +56,12 @@ class Regions:
 
     Attributes:
         boxes: Boxes, [M, 4] float32, x0 y0 x1 y1, pixels.
-        scores: Scores, [M] float32, 0..1. A Gaussian in several regions is assigned to the one with
-            the largest product of overlap and score.
+        scores: Scores, [M] float32, 0..1. A Gaussian in several regions is assigned to the region
+            with the largest product of overlap and score.
         rects: Rectangle of the image that the mask of each region covers: column, row, width and
-            height, [M, 4] int32, pixels. Width 0: the region has no mask and is its whole box.
-        sums: Summed-area tables [height + 1, width + 1] of the masks, concatenated, [S] int32.
+            height, [M, 4] int32, pixels. A region of width 0 has no mask and is its whole box.
+        sums: Summed-area tables of all masks, flattened and concatenated, int32. The table of a
+            mask has the shape [height + 1, width + 1].
     """
 
     boxes: np.ndarray
@@ -69,7 +71,12 @@ class Regions:
 
     @classmethod
     def of_boxes(cls, boxes: np.ndarray, scores: np.ndarray) -> "Regions":
-        """Return regions that are whole boxes [M, 4], with scores [M]."""
+        """Return regions that are whole boxes.
+
+        Args:
+            boxes: Boxes, [M, 4], x0 y0 x1 y1, pixels.
+            scores: Scores, [M], 0..1.
+        """
         return cls(*_float32(boxes, scores), np.zeros((len(boxes), 4), np.int32), _NO_SUMS)
 
     @classmethod
@@ -78,7 +85,7 @@ class Regions:
     ) -> "Regions":
         """Return regions that are the foreground pixels of their boxes.
 
-        A region whose foreground has no pixel gets no Gaussian.
+        A region whose foreground has no pixels is assigned no Gaussians.
 
         Args:
             boxes: Boxes, [M, 4], x0 y0 x1 y1, pixels.
@@ -97,11 +104,11 @@ class Assignment:
     """Assignment of V Gaussians to the regions of an image.
 
     Attributes:
-        regions: Number of the region of each Gaussian, [V] int32. UNMATCHED: in no region. HIDDEN:
-            outside of the image, or rejected by the depth test at its pixel.
-        overlaps: Overlap of each Gaussian with its region, [V] float32, 0..1; 0 without a region.
-            `AssignmentConfig.rule` selects the measure: IoU or covered fraction of the splat.
-        depths_m: Depths of the Gaussians in the camera frame, [V] float32.
+        regions: Number of the region of each Gaussian, [V] int32. UNMATCHED means that the Gaussian
+            is in no region. HIDDEN means that it is outside the image or failed the depth test.
+        overlaps: Overlap of each Gaussian with its region, [V] float32, 0..1; 0 if it has none.
+            `AssignmentConfig.rule` selects the measure: IoU, or the covered fraction of the splat.
+        depths_m: Depths of the Gaussians in the camera frame, [V] float32, meters.
     """
 
     regions: np.ndarray
@@ -122,26 +129,26 @@ def assign_gaussians(
 ) -> Assignment:
     """Assign Gaussians to the regions of an image.
 
-    Each Gaussian is projected as in rendering, S = J R Sigma R' J' + 0.3 px^2 I. Its splat is the
-    axis-aligned box of two standard deviations around its center, clipped to the image. A Gaussian
-    is HIDDEN if it is not finite, if its center lies outside of the image, or if its depth differs
-    by max_depth_gap_m or more from the measured depth at that pixel. With the depth test
-    `one_sided`, a Gaussian in front of the measured depth is not HIDDEN. Any other Gaussian may be
-    assigned to a region if overlap > min_overlap:
+    Each Gaussian is projected as in rendering, with the image covariance J R Sigma R' J' +
+    0.3 px^2 I. Its splat is the axis-aligned box of two standard deviations around the projected
+    center, clipped to the image. A Gaussian is HIDDEN if its center is outside the image or not
+    finite. It is also HIDDEN if its depth differs by max_depth_gap_m or more from the measured
+    depth at the center. With the depth test `one_sided`, this applies only to Gaussians behind the
+    measured depth. Any other Gaussian may be assigned to a region if overlap > min_overlap:
 
         rule `coverage`:  overlap = area(splat and region) / area(splat)
         rule `iou`:       overlap = area(splat and region) / area(splat or region)
 
-    With `coverage`, the center of the Gaussian must lie in the region too, because depth was tested
-    at the center. If a Gaussian may be assigned to several regions, it gets the one with the
-    largest product of overlap and score; of equal ones, the first. The result is bitwise equal for
-    any number of threads.
+    With `coverage`, the center of the Gaussian must also lie in the region, because the depth is
+    tested only at the center. Of several possible regions, the Gaussian gets the region with the
+    largest product of overlap and score; if the products are equal, the first region. The result is
+    bitwise equal for any number of threads.
 
     Args:
-        rows: Gaussians of the map, [N, 16] float32.
-        indices: Rows of the V Gaussians to assign, [V] uint32, ascending; see
+        rows: Gaussians of the map, [N, 16] float32, see `gaussians.rows`.
+        indices: Row numbers of the V Gaussians to assign, [V] uint32, ascending; see
             `Contributions.indices`.
-        camera: Intrinsics of depth_m, without distortion.
+        camera: Intrinsics of the depth image, without distortion.
         T_camera_map: Transform from the map to the camera, [4, 4].
         depth_m: Measured depth, [H, W] float32, meters; 0 where unknown.
         regions: Regions of the image.
@@ -152,10 +159,10 @@ def assign_gaussians(
         The region of each Gaussian.
 
     Raises:
-        ValueError: If the shapes or types of the arrays do not fit.
+        ValueError: An array has a wrong shape or type.
 
-    Example: the splat of a Gaussian with a sigma of 1 px at (2, 5) is [0, 4] x [3, 7], 16 px^2. A
-    region of 64 px^2 that begins at x = 2 covers half of the splat, 8 px^2:
+    Example: a Gaussian has a standard deviation of 1 px and its center at pixel (2, 5). Its splat
+    is [0, 4] x [3, 7] and has 16 px^2. A region of 64 px^2 begins at x = 2 and covers 8 px^2 of it:
 
     >>> camera, depth_m = Camera(20, 10, 10.0, 10.0, 2.0, 5.0), np.ones((10, 20), np.float32)
     >>> row = np.zeros((1, 16), np.float32)

@@ -1,10 +1,12 @@
-"""Table of object landmarks: for each, a sample of its Gaussians and values derived from it.
+"""Table of object landmarks, each with a sample of the Gaussians of one object.
 
-A landmark stores the ids of at most 256 of its Gaussians, the members, and a number of votes for
-each member. A fixed rule shuffles all ids, and the Gaussians whose ids come first are the members.
-The members are therefore a uniform sample, independent of the order in which Gaussians were added.
-Position and label of a landmark are derived from the members' rows and labels in the map and change
-with them.
+The members of a landmark are at most 256 of its Gaussians. The landmark stores the id and the votes
+of each member. A member gains votes in keyframes that show it in the region of the object. It loses
+votes in keyframes that show it outside of this region.
+
+A fixed rule shuffles the ids of Gaussians, and the first 256 in this order are the members. The
+members are therefore a uniform sample, independent of the order in which Gaussians were added. The
+position and label of a landmark are derived from the members, and change when the map changes.
 """
 
 import numpy as np
@@ -50,7 +52,7 @@ LANDMARK = np.dtype(
 
 
 def new_landmarks(n: int, keyframe: int) -> np.ndarray:
-    """Return n candidates for objects, first observed in `keyframe`, without Gaussians."""
+    """Return records of n new candidate objects without Gaussians, first observed in `keyframe`."""
     table = np.zeros(n, LANDMARK)
     table["id"] = table["view_keyframes"] = NO_MEMBER
     table["members"], table["T_map_object"] = NO_MEMBER, np.eye(4)
@@ -64,9 +66,9 @@ def distributions(table: np.ndarray) -> np.ndarray:
 
 
 def labels_of(table: np.ndarray) -> np.ndarray:
-    """Return the most probable label other than background of K records of `LANDMARK`, [K] uint8.
+    """Return the most probable label of each landmark that is not background, [K] uint8.
 
-    The labels of a record are sorted, the most probable first.
+    `table` has K records of `LANDMARK`, whose labels are sorted by probability.
     """
     first = table["labels"][:, 0]
     return np.where(first == BACKGROUND, table["labels"][:, 1], first)
@@ -81,9 +83,9 @@ def entropies(table: np.ndarray) -> np.ndarray:
 def shuffled(ids: np.ndarray) -> np.ndarray:
     """Return a sort key for each id, [...] uint64, that shuffles the ids by a fixed rule.
 
-    Each id has a key of its own, and NO_MEMBER has the largest key. The key is the id times an odd
-    number, which permutes the 64-bit numbers. The number is derived from the golden ratio, so that
-    the keys of consecutive ids are spread.
+    Different ids have different keys. NO_MEMBER (-1), which marks an unused entry, has the largest
+    key. The key is the id times a constant odd number, modulo 2^64. The constant is derived from
+    the golden ratio, so that the keys of consecutive ids are far apart.
     """
     places = ids.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     return np.where(ids == NO_MEMBER, np.uint64(2**64 - 1), places)
@@ -94,9 +96,9 @@ def merged_members(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Merge two lists of members for each of K landmarks.
 
-    A member of both lists keeps its votes of the first list. Members with zero votes are first
-    removed from the first list. If more than 256 members remain, those that come first in shuffled
-    order are kept.
+    Members are ids of Gaussians. The members of the first list that have zero votes are removed
+    first. A member that is then in both lists keeps its votes from the first list. If there are
+    more than 256 members, the first 256 in the order of `shuffled` are kept.
 
     Args:
         members: Ids of the first list, [K, M].
@@ -121,10 +123,10 @@ def _in_order(ids: np.ndarray, votes: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def reliable_members(table: np.ndarray) -> np.ndarray:
-    """Return which members are reliable, [K, 256] bool.
+    """Return which members of K landmarks are reliable, [K, 256] bool.
 
-    The members of a landmark are at most 256 of its Gaussians; each has a number of votes. A member
-    is reliable if it has at least a third of the most votes that any member of the landmark has.
+    The members of a landmark are at most 256 of its Gaussians, and each member has a vote count. A
+    member is reliable if its count is at least a third of the highest count in the landmark.
     Gaussians next to an object get few votes, because the edges of regions vary between keyframes.
 
     Args:
@@ -134,9 +136,9 @@ def reliable_members(table: np.ndarray) -> np.ndarray:
 
 
 def rows_of(members: np.ndarray, ids: np.ndarray) -> np.ndarray:
-    """Return the rows of members in the map, [...]; -1 if a member is not in memory.
+    """Return the row of each member in the arrays of the map, [...]; -1 if it is not in memory.
 
-    A member is a Gaussian of a landmark's sample.
+    The members of a landmark are a sample of its Gaussians.
 
     Args:
         members: Ids of the members, [...].
@@ -161,7 +163,7 @@ def derive(
     anchors: np.ndarray,
     least: int,
 ) -> None:
-    """Derive pose, size, label and anchor of landmarks [K] from the map, in place.
+    """Derive pose, size, label and anchor keyframe of K landmarks from the map, in place.
 
     The values come from the members of a landmark, a sample of its Gaussians. Members are used if
     they have enough votes (see `reliable_members`) and are in memory rather than on disk. Landmarks
@@ -198,12 +200,12 @@ def derive(
 
 
 def derive_in_batches(table: np.ndarray, *gaussians: np.ndarray, least: int) -> None:
-    """Derive landmarks [K] in place, in batches that stay in cache.
+    """Derive K landmarks as `derive` does, in batches that fit into the CPU cache.
 
     Args:
-        table: Landmarks, [K] records of `LANDMARK`.
-        *gaussians: Rows, labels, ids and anchors of the map, see `derive`.
-        least: Minimum number of usable members; see `derive`.
+        table: Landmarks, [K] records of `LANDMARK`; changed in place.
+        *gaussians: Arguments `rows`, `labels`, `ids` and `anchors` of `derive`.
+        least: Argument `least` of `derive`.
     """
     for start in range(0, len(table), _AT_A_TIME):
         derive(table[start : start + _AT_A_TIME], *gaussians, least=least)
@@ -220,8 +222,8 @@ def moments(p_map: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndar
 
         mu = sum_m w_m x_m / sum_m w_m,  Sigma = sum_m w_m (x_m - mu) (x_m - mu)' / sum_m w_m
 
-    The points at the two ends of each axis, 2 % each, are excluded as outliers. See the landmarks
-    in the LDO-SLAM paper, III.C.
+    x_m is a point of a set, w_m is its weight, and ' means transpose. Along each axis, 2 % of the
+    points at each end are excluded as outliers. See the LDO-SLAM paper, III.C.
 
     Args:
         p_map: Points in the map frame, [K, M, 3], meters.
@@ -230,8 +232,8 @@ def moments(p_map: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndar
     Returns:
         Means, [K, 3], meters, and covariances, [K, 3, 3], m^2.
 
-    Example: two points lie on the x axis; the one at 4 has three times the weight. mu = 12 / 4,
-    Sigma = (9 + 3) / 4.
+    Example: two points lie on the x axis, at 0 m with weight 1 and at 4 m with weight 3. Along x,
+    mu = 12 / 4 = 3 m and Sigma = (9 + 3) / 4 = 3 m^2.
 
     >>> mean, covariance = moments(np.array([[[0.0, 0, 0], [4, 0, 0]]]), np.array([[1.0, 3.0]]))
     >>> mean[0].tolist(), covariance[0].diagonal().tolist()
@@ -248,15 +250,15 @@ def moments(p_map: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def trimmed(values: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and the highest of M values after removal of 2 % at each end.
+    """Return the minimum and maximum of values after removal of the lowest and highest 2 %.
 
     Args:
-        values: Values, [K, M, D].
+        values: K sets of M values in D dimensions, [K, M, D].
         valid: Values to use, [K, M] bool.
 
     Returns:
-        Lowest values and highest values, [K, D] each; infinity and minus infinity if no value is
-        valid.
+        Minimum and maximum of each set in each dimension, [K, D] each. If a set has no valid value,
+        its minimum is infinity and its maximum is minus infinity.
     """
     count = np.count_nonzero(valid, axis=1)[:, None]
     ordered = np.where(valid[:, None], np.swapaxes(values, 1, 2), np.inf)
@@ -275,16 +277,18 @@ def boxes(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return boxes around K sets of points.
 
-    By default, a box is parallel to the axes of the map. If a box along the principal axes of the
-    points has less than four fifths of this box's volume, the smaller box is returned instead.
+    By default, a box is parallel to the axes of the map. It is parallel to the principal axes of
+    the points if that reduces its volume to less than 80 %. Along each axis of a box, 2 % of the
+    points at each end are excluded as outliers.
 
     Args:
         p_map: Points in the map frame, [K, M, 3], meters.
-        valid: Points to use, [K, M] bool; 2 % at each end of an axis are excluded as outliers.
+        valid: Points to use, [K, M] bool.
         covariance: Covariances of the points, [K, 3, 3], m^2.
 
     Returns:
-        T_map_object, [K, 4, 4], with the center and axes of the boxes, and their sizes, [K, 3], m.
+        T_map_object, [K, 4, 4], with the center and axes of each box, and the sizes of the boxes
+        along these axes, [K, 3], meters.
     """
     _, main = np.linalg.eigh(covariance)
     main = main[..., ::-1] * np.sign(_largest(main[..., ::-1]))[:, None]  # Fix the arbitrary signs.
@@ -327,7 +331,7 @@ def _commonest(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 
 def moved(table: np.ndarray, T_new_old: np.ndarray) -> None:
-    """Move landmarks [K] by the corrections T_new_old [K, 4, 4] of the map frame, in place."""
+    """Move each of K landmarks by its correction T_new_old [K, 4, 4] in the map frame, in place."""
     R, t = T_new_old[:, :3, :3], T_new_old[:, :3, 3]
     table["centroid"] = (R @ table["centroid"][..., None])[..., 0] + t
     table["covariance"] = R @ table["covariance"] @ np.swapaxes(R, 1, 2)
@@ -338,8 +342,8 @@ def moved(table: np.ndarray, T_new_old: np.ndarray) -> None:
 def within(table: np.ndarray, camera: Camera, T_camera_map: np.ndarray) -> np.ndarray:
     """Return which landmarks may be in view of a camera, [K] bool.
 
-    The test is whether a bounding sphere of the landmark intersects the camera's view. `table` has
-    K records of `LANDMARK`.
+    A landmark may be in view if its bounding sphere intersects the camera's view. `table` has K
+    records of `LANDMARK`.
     """
     p = table["centroid"] @ T_camera_map[:3, :3].T + T_camera_map[:3, 3]
     # Twice the radius of the box's bounding sphere, because some members lie outside of the box.

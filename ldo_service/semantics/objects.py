@@ -49,8 +49,9 @@ CANDIDATE = -1  # Value of `id` for a landmark that is a candidate.
 class Objects:
     """Table of all landmarks: objects and candidates.
 
-    The class is not thread-safe. The same calls give bitwise equal results, also after `unpack`. An
-    object keeps its id until it is merged into another one or removed. Ids are never reused.
+    The class is not thread-safe. The same calls give bitwise equal results, even after the table
+    was restored by `unpack`. An object keeps its id until the object is removed or merged into
+    another object. Ids are never reused.
     """
 
     def __init__(self, config: ObjectsConfig | None = None) -> None:
@@ -75,16 +76,16 @@ class Objects:
         Regions are associated with objects first, and the remaining regions with candidates. A
         region without an associated landmark creates a candidate.
 
-        A candidate becomes an object after min_keyframes observations that agree with it:
-        KL(p || p_t) < max_divergence. Here, p is the mean label distribution of the candidate's
-        Gaussians before the keyframe, and p_t that of the Gaussians in the region. Both means are
+        A candidate becomes an object after `min_keyframes` observations with KL(p || p_t) <
+        `max_divergence`. p is the mean label distribution of the candidate's Gaussians before the
+        keyframe. p_t is the mean label distribution of the Gaussians in the region. Both means are
         weighted by opacity. An observation with a larger divergence restarts the count.
 
         Args:
             view: The map and the regions of the keyframe.
             undetectable: Labels that the detector does not know, [256] bool. An object with such a
-                label counts as missed only if the measured depth shows that it is gone. None: the
-                detector knows all labels.
+                label counts as missed only if the measured depth shows that the object is gone.
+                None: the detector knows all labels.
             is_late: True if the keyframe was observed before and the view has only regions whose
                 labels arrived later. Objects then gain no observation, and no landmark counts as
                 missed. A candidate gains an observation only if the keyframe is before its first or
@@ -316,10 +317,10 @@ class Objects:
         """Move the landmarks after a correction of the keyframe poses.
 
         Each landmark moves with one keyframe: the anchor keyframe of most of its Gaussians.
-        `refresh` then derives exact poses for the landmarks whose Gaussians are in memory.
+        A later call of `refresh` derives exact poses for landmarks whose Gaussians are in memory.
 
         Args:
-            T_new_old: Correction of each moved keyframe in the map frame, [4, 4], by id.
+            T_new_old: Corrections in the map frame, [4, 4], by id of the moved keyframe.
         """
         corrected = np.array(sorted(T_new_old), np.int64)
         which = np.flatnonzero(np.isin(self._table["anchor"], corrected))
@@ -345,7 +346,8 @@ class Objects:
             labels: Label rows of the Gaussians, [N, 32] uint8, see `gaussian_labels.ROW`.
             ids: Ids of the Gaussians, [N], ascending.
             anchors: Anchor keyframes of the Gaussians, [N].
-            seen_from: Camera and T_map_camera [4, 4] that select the landmarks in view; None: all.
+            seen_from: Camera and its pose T_map_camera, [4, 4]; only landmarks in view of this
+                camera are derived. None: all landmarks are derived.
         """
         which = np.arange(len(self._table))
         if seen_from:
@@ -364,16 +366,17 @@ class Objects:
 
     @staticmethod
     def unpack(packed: Mapping[str, Any], config: ObjectsConfig | None = None) -> "Objects":
-        """Restore the objects from `pack`.
+        """Restore the objects from the result of `pack`.
 
         Raises:
-            ValueError: If the landmarks have another format.
+            ValueError: If another version wrote the landmarks in another format.
         """
         table = np.ascontiguousarray(packed["landmarks"])
         if table.dtype != np.uint8 or table.ndim != 2 or table.shape[1] != LANDMARK.itemsize:
             raise ValueError(
-                f"landmarks are {table.dtype}{table.shape}, must be uint8[K, {LANDMARK.itemsize}]: "
-                "another version of the service wrote them; restore them with that version."
+                f"the array of landmarks is {table.dtype}{table.shape}, but must be uint8[K, "
+                f"{LANDMARK.itemsize}]: another version of the service wrote it. Restore it with "
+                "that version."
             )
         out = Objects(config)
         out._table = table.copy().view(LANDMARK)[:, 0]

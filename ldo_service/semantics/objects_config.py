@@ -31,12 +31,13 @@ class AssociationConfig:
         if not (0 < self.min_iou <= 1 and 0 <= self.min_shared <= 1):
             raise ConfigError(
                 named(self, "min_iou", "min_shared")
-                + ": min_iou must be in (0, 1], min_shared in [0, 1]."
+                + ": min_iou must be in (0, 1], and min_shared must be in [0, 1]."
             )
         if self.max_depth_gap_m <= 0 or min(self.min_gaussians, self.max_regions) < 1:
             raise ConfigError(
                 named(self, "max_depth_gap_m", "min_gaussians", "max_regions")
-                + ": max_depth_gap_m must be positive, min_gaussians and max_regions at least 1."
+                + ": max_depth_gap_m must be positive; min_gaussians and max_regions must be at "
+                "least 1."
             )
         if self.part_inside <= 0:
             raise ConfigError(
@@ -85,10 +86,11 @@ class ObjectsConfig:
             *("candidate_miss_limit", "max_objects", "max_candidates"),
         )
         if min(getattr(self, name) for name in counts) < 1:
-            raise ConfigError(named(self, *counts) + ": each must be at least 1.")
+            raise ConfigError(named(self, *counts) + ": each of these values must be at least 1.")
         if min(self.max_divergence, self.uncertain_entropy) < 0:
             raise ConfigError(
-                named(self, "max_divergence", "uncertain_entropy") + ": each must be at least 0."
+                named(self, "max_divergence", "uncertain_entropy")
+                + ": each of these values must be at least 0."
             )
         if not (0 < self.min_visible <= 1 and 0 < self.merge_overlap <= 1):
             raise ConfigError(

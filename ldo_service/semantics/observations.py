@@ -1,4 +1,4 @@
-"""Observations and misses of objects in a keyframe; updates of landmarks: views, votes, merges."""
+"""Observations and misses of objects in a keyframe, and the updates of landmarks by them."""
 
 from dataclasses import dataclass
 
@@ -44,7 +44,7 @@ class ObservedObject:
 
 @dataclass(frozen=True, slots=True)
 class ObjectUpdate:
-    """Changes of the objects by a keyframe."""
+    """Changes of the map's objects that one keyframe causes."""
 
     observations: tuple[ObservedObject, ...] = ()  # Observations and misses.
     created: tuple[int, ...] = ()  # Ids of new objects.
@@ -64,11 +64,13 @@ class KeyframeSemantics:
 
 
 def one_each(members: np.ndarray) -> np.ndarray:
-    """Return the first votes of the members of K landmarks: one for each member, [K, 256] int8.
+    """Return the initial votes of the members of K landmarks, [K, 256] int8.
+
+    A member has one vote at first. An unused entry has no vote.
 
     Args:
-        members: Ids of the Gaussians of each landmark's sample, [K, 256]; NO_MEMBER where unused,
-            which gets 0 votes.
+        members: Ids of the sampled Gaussians of each landmark, [K, 256]; NO_MEMBER (-1) in unused
+            entries.
     """
     return (members != NO_MEMBER).astype(np.int8)
 
@@ -80,13 +82,13 @@ def update_votes(
 
     The members of a landmark are a sample of its Gaussians. A member in the region of its landmark
     gains a vote, up to 8. A member loses a vote if it is visible outside of this region, or if it
-    was removed from the map or offloaded to disk. A member without votes gains none again.
+    was removed from the map or offloaded to disk. A member with zero votes gains no more votes.
 
     Args:
         votes: Votes before the keyframe, [K, 256].
         rows: Rows of the members in the map, [K, 256]; -1 if not in memory.
         view: The map and the regions of the keyframe.
-        numbers: Number of the region that each landmark was associated with, [K].
+        numbers: Number of the region with which each landmark was associated, [K].
     """
     # `searchsorted` would convert all of `indices` if the dtypes differed.
     wanted = np.maximum(rows, 0).astype(view.indices.dtype)
@@ -100,12 +102,12 @@ def update_votes(
 
 
 def add_views(table: np.ndarray, keyframe: int, shown: np.ndarray, boxes: np.ndarray) -> None:
-    """Add a keyframe to the best views of K landmarks, in place.
+    """Add a view of a keyframe to each of K landmarks, and keep their three best views.
 
-    The score of a view is the visible fraction times the square root of the box's area.
+    The score of a view is the visible fraction times the square root of the box's area in pixels.
 
     Args:
-        table: Landmarks, [K] records of `LANDMARK`.
+        table: Landmarks, [K] records of `LANDMARK`; changed in place.
         keyframe: Id of the keyframe.
         shown: Visible fraction of each landmark, [K], 0..1.
         boxes: Box of each landmark in the keyframe, [K, 4], x0 y0 x1 y1, pixels.
@@ -146,17 +148,17 @@ def find_missed(
     """Find landmarks that count as missed in a keyframe if no region was associated with them.
 
     A landmark counts as missed if it should be visible and the detector knows its label. It also
-    counts as missed if the depth camera measured a surface behind it, so that it must be gone.
+    counts as missed if the depth camera measured a surface behind the landmark.
 
     Args:
         table: Landmarks, [K] records of `LANDMARK`.
-        predicted: Their predicted boxes and visibility in the keyframe.
+        predicted: Predicted boxes and visibility of the landmarks in the keyframe.
         undetectable: Labels that the detector does not know, [256] bool. None: the detector knows
             all labels.
         config: Settings of the objects.
 
     Returns:
-        [K] bool.
+        True for each landmark that counts as missed, [K] bool.
     """
     sides = np.clip(predicted.boxes[:, 2:] - predicted.boxes[:, :2], 0, None)
     is_large = np.sqrt(np.prod(sides, axis=1)) >= config.min_side_px
@@ -191,14 +193,14 @@ def neighbors(table: np.ndarray, near: np.ndarray, matched: np.ndarray) -> list[
 def boxes_overlap(one: np.ndarray, other: np.ndarray, view: MapView, least: float) -> bool:
     """Return whether the Gaussians of one landmark mostly lie in the box of another landmark.
 
-    Both directions are tested: the Gaussians of `one` with the box of `other`, and the Gaussians of
-    `other` with the box of `one`. The larger of the two fractions must be at least `least`.
+    One fraction is that of the Gaussians of `one` in the box of `other`. The second is that of the
+    Gaussians of `other` in the box of `one`. The larger fraction must be at least `least`.
 
     Args:
         one: First landmark, as an array with one record of `LANDMARK`.
         other: Second landmark, in the same format.
         view: The map with the Gaussians of both landmarks.
-        least: Minimum fraction, 0..1, of the Gaussians from `resident_positions`.
+        least: Minimum fraction, 0..1. It refers to the Gaussians that `resident_positions` returns.
     """
     shares = (
         inside(other[0], resident_positions(one, view)),
@@ -208,10 +210,10 @@ def boxes_overlap(one: np.ndarray, other: np.ndarray, view: MapView, least: floa
 
 
 def merge_into(one: np.ndarray, gone: np.ndarray) -> None:
-    """Merge the landmark `gone` into the landmark `one`: its members, counts and best views.
+    """Merge members, counts and best views of the landmark `gone` into the landmark `one`.
 
-    Both are arrays with one record of `LANDMARK`; `one` changes in place. The caller must derive
-    pose, size and label of `one` again.
+    Both arguments are arrays with one record of `LANDMARK`; `one` changes in place. The caller must
+    then derive pose, size and label of `one` again.
     """
     one["members"], one["votes"] = merged_members(
         one["members"], one["votes"], gone["members"], gone["votes"]
@@ -240,8 +242,8 @@ def inside(landmark: np.ndarray, p_map: np.ndarray) -> float:
 def resident_positions(landmark: np.ndarray, view: MapView) -> np.ndarray:
     """Return the positions of a landmark's Gaussians in the map frame, [M, 3], meters.
 
-    Gaussians of the landmark's sample are used if they have enough votes (see `reliable_members`)
-    and are in memory. `landmark` is an array with one record of `LANDMARK`.
+    The landmark stores a sample of its Gaussians. Of these, only Gaussians in memory with enough
+    votes are used; see `reliable_members`. `landmark` is an array with one record of `LANDMARK`.
     """
     where = rows_of(landmark["members"][reliable_members(landmark)], view.ids)
     return view.rows[where[where >= 0], :3].astype(float)

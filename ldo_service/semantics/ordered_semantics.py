@@ -1,15 +1,15 @@
-"""Labels and objects of a map that do not depend on when label results arrive.
+"""Labels and objects of a map, made independent of the arrival times of label results.
 
-A label result labels Gaussians, and later keyframes use these labels: for their objects, for the
-names of their regions and for the choice of the next label requests. If keyframes are processed
-before an earlier result has arrived, labels and objects therefore depend on the speed of the
-labeller and of the detector.
+A label result labels Gaussians. Later keyframes use these labels for their objects, for the names
+of their regions and for the choice of the next label requests. Labels and objects would therefore
+depend on the speed of labeller and detector if keyframes were processed only once, on arrival.
 
-The live semantics, which the map shows, never wait for label results. Before they process a
-keyframe while a label result is missing, a copy of them is made. The copy processes this keyframe
-and all later ones a second time, whenever the mapper has no message to handle. It processes each
-keyframe only after the results of all earlier requests. Results that are known are not requested
-again. When the copy has processed all keyframes, it replaces the live semantics.
+The live semantics are the labels and objects that the map shows. They never wait for label results.
+When a keyframe arrives while a label result is missing, this module first copies the live
+semantics. The copy processes this keyframe and all later keyframes a second time, whenever the
+mapper has no message to handle. The copy processes a keyframe only after the results of all earlier
+requests have arrived. It requests no result that has already arrived. When the copy has processed
+all keyframes, it replaces the live semantics.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -38,10 +38,10 @@ FIRST_REGION = 1 << 32
 
 
 class OrderedSemantics:
-    """Labels and objects of a map, and a copy of them that waits for label results: `DelayedCopy`.
+    """Labels and objects of a map, and a `DelayedCopy` of them that waits for label results.
 
-    The copy processes each keyframe again, after the results of all earlier label requests. It
-    exists only while results are missing, and replaces the live semantics at the end.
+    The copy processes each keyframe again after the results of all earlier label requests have
+    arrived. When the copy has processed all keyframes, it replaces the live semantics.
 
     Attributes:
         live: The labels and objects that the map shows; they never wait for label results.
@@ -160,14 +160,14 @@ class OrderedSemantics:
 
     # --- copy -------------------------------------------------------------------------------------
     def has_work(self) -> bool:
-        """Return whether `step` can be called: a `DelayedCopy` exists, and all results are here."""
+        """Return whether a `DelayedCopy` exists and has all label results for its next `step`."""
         return self._copy is not None and not self._waiting and not self._sent
 
     def step(self) -> "OrderedStep":
         """Advance the `DelayedCopy` by one label result or one keyframe.
 
-        Label results that are due are used before the next keyframe. After the last keyframe, the
-        copy replaces the live semantics.
+        The copy applies all label results of earlier keyframes before it processes the next
+        keyframe. After the last keyframe, the copy replaces the live semantics.
         """
         copy, gaussians = self._copy, self._map.gaussians
         assert copy is not None
@@ -216,7 +216,7 @@ class OrderedSemantics:
         self._copy = saved and DelayedCopy.restored(saved, self._new_semantics(saved["semantics"]))
 
     def metrics(self) -> dict[str, float]:
-        """Return the counters of the live semantics and of each `DelayedCopy` so far."""
+        """Return the counters of the live semantics and of all copies made so far."""
         return {
             **self.live.metrics(),
             # Keyframes that are still to be processed again, while no message arrives.
@@ -236,10 +236,10 @@ class OrderedStep:
 
 
 def packed_result(result: RegionLabelResult) -> Sequence[Any]:
-    """Return a label result as plain values."""
+    """Return label, confidence and other labels of a label result, to be saved in a state."""
     return result.label, result.confidence, result.others
 
 
 def unpacked_result(label: str, confidence: float, others: Sequence[Any]) -> RegionLabelResult:
-    """Restore a label result from `packed_result`."""
+    """Restore a label result from the values that `packed_result` returned."""
     return RegionLabelResult(label, confidence, tuple((name, sure) for name, sure in others))

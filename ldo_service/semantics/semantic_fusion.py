@@ -1,7 +1,7 @@
 """Fusion of a keyframe's regions into the labels of the map.
 
-The detector's and the labeller's label of a region are first fused into one (LDO-SLAM paper,
-III.B). The module also renders the labels of the map as label images.
+A region may have a label by the detector and a label by the labeller. The module fuses both into
+one label (LDO-SLAM paper, III.B). It also renders the labels of the map as label images.
 """
 
 from dataclasses import dataclass, field
@@ -73,7 +73,7 @@ class FusedLabels:
         labels: Fused labels, [V] int16.
         confidences: Fused confidences, [V] float32, 0..1; SemConf in the LDO-SLAM paper, III.B.
         alpha: Weight of the detector, [V] float32, 0..1.
-        by_detector: Contribution of the detector, alpha Conf_YOLO, [V] float32.
+        by_detector: Contribution of the detector: alpha times its confidence, [V] float32.
     """
 
     labels: np.ndarray
@@ -102,16 +102,16 @@ def fuse_confidences(
 
     Args:
         detector_labels: Labels of the detector, [V] int.
-        detector_confidences: Confidences of the detector, [V], 0..1; 0 without a detection.
+        detector_confidences: Conf_YOLO of the detector, [V], 0..1; 0 without a detection.
         overlaps: Overlap of each Gaussian with its region, IoU or coverage, [V], 0..1.
         open_labels: Labels of the labeller, [V] int.
-        open_confidences: Confidences of the labeller, [V], 0..1; 0 if the labeller was not invoked
-            or gave no label.
-        config: Settings of the fusion.
+        open_confidences: Conf_VLM of the labeller, [V], 0..1; 0 if the labeller was not invoked or
+            gave no label.
+        config: Settings of the fusion, with `rule`, `beta`, `epsilon` and `fixed_alpha`.
 
-    Example: a box with a score of 0.8 covers half of a splat, and the labeller has a confidence of
-    0.6. r = 0.4 and 0.6, alpha = 0.16 / (0.16 + 0.36), SemConf = 0.308 * 0.8 + 0.692 * 0.6. The
-    labeller wins, 0.415 to 0.246:
+    Example: a box with Conf_YOLO = 0.8 covers half of a Gaussian, and Conf_VLM is 0.6. Therefore
+    r_YOLO = 0.4, r_VLM = 0.6, alpha = 0.16 / (0.16 + 0.36) = 0.308. The labeller's label is used,
+    because (1 - alpha) 0.6 = 0.415 is more than alpha 0.8 = 0.246. SemConf is 0.415 + 0.246:
 
     >>> one = fuse_confidences(*np.array([[7], [0.8], [0.5], [9], [0.6]]), FusionConfig())
     >>> int(one.labels[0]), round(float(one.alpha[0]), 3), round(float(one.confidences[0]), 3)
@@ -159,10 +159,10 @@ def label_image(
 ) -> np.ndarray:
     """Render the labels of the map: at each pixel the label s with the largest sum_i w_i p_i(s).
 
-    w_i is the weight of Gaussian i in the pixel and p_i its label distribution. Of labels with
-    equal sums, the one with the lower index is used. Pixels without Gaussians are background. The
-    function is slow and meant for evaluation and pictures: it renders the map once for every three
-    labels.
+    w_i is the weight of Gaussian i in the pixel, and p_i(s) is its probability of label s. Of
+    labels with equal sums, the label with the lowest index is used. Pixels without Gaussians are
+    background. The function renders the map once for every three labels. It is therefore slow, and
+    meant for evaluation and pictures.
 
     Args:
         rows: Gaussians of the map, [N, 16].
@@ -222,8 +222,8 @@ class FusionResult:
 
     Attributes:
         assigned: Region of each Gaussian.
-        seen: Observations of the Gaussians.
-        disagreement: Label disagreement before the smoothing step.
+        seen: Label observations of the Gaussians.
+        disagreement: Label disagreement of neighboring Gaussians before labels were smoothed.
     """
 
     assigned: Assignment
@@ -304,7 +304,7 @@ def assign_detections(
     *,
     threads: int = 1,
 ) -> Assignment:
-    """Assign the Gaussians that contribute to a keyframe to its regions.
+    """Assign each Gaussian that contributes to the image of a keyframe to a region, or to none.
 
     The arguments are those of `fuse_detections`.
     """
@@ -318,10 +318,10 @@ def assign_detections(
 def regions_of(
     detections: RegionDetections, depth_m: np.ndarray, camera: Camera, config: SemanticFusionConfig
 ) -> Regions:
-    """Return the region of each box, which is the foreground in the box.
+    """Return the region of each box.
 
-    With the setting `region: box`, the region is the whole box. A foreground does not include the
-    pixels of smaller regions that are nested in it.
+    By default, the region is the foreground in the box, without smaller regions that are nested in
+    the foreground. With the setting `region: box`, the region is the whole box.
 
     Args:
         detections: Boxes and scores, with foregrounds where they are already known.
@@ -352,11 +352,11 @@ def observations(
     *,
     is_late: bool = False,
 ) -> Observations:
-    """Return the observations of Gaussians.
+    """Return the label observations of Gaussians in a keyframe.
 
-    A Gaussian in a region gets the label of the region with a confidence. A visible Gaussian that
-    is in no region gets the label MISS. The extent of an object is the side of a square with the
-    area of its box, converted to meters at the depth of the Gaussian.
+    A Gaussian in a region gets the label and confidence of the region. A visible Gaussian that is
+    in no region gets the label MISS. The observed extent of the Gaussian's object is the square
+    root of the box's area, converted to meters at the depth of the Gaussian.
 
     Args:
         where: Region of each Gaussian.

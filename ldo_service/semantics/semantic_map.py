@@ -1,4 +1,4 @@
-"""Labels of the Gaussians of a map, and its objects."""
+"""Labels of the Gaussians of a map, and the objects of the map."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -29,12 +29,12 @@ from .semantic_map_config import SemanticMapConfig
 
 
 class SemanticMap:
-    """Labels of the Gaussians of a MapBuilder, and the objects that these Gaussians form.
+    """Labels of the Gaussians of a `MapBuilder`, and the objects that these Gaussians form.
 
-    The MapBuilder stores the images and the current pose of each keyframe. The detections of a
+    The `MapBuilder` stores the images and the current pose of each keyframe. The detections of a
     keyframe are fused once. Label results of the keyframe's regions are fused when they arrive. The
-    same inputs give the same results if the MapBuilder is deterministic. Without detections and
-    labels, this class does not change the map.
+    same inputs give the same results if the `MapBuilder` is deterministic. Without detections and
+    label results, this class does not change the map.
     """
 
     def __init__(
@@ -317,7 +317,7 @@ class SemanticMap:
         return assign_detections(rows, indices, *at, threads=self._threads).regions
 
     def refresh(self, view: TrainingView | None = None) -> None:
-        """Derive objects from their Gaussians again.
+        """Derive pose, size and label of objects from their Gaussians again.
 
         Args:
             view: Keyframe; only objects in its view are derived. None: all objects are derived.
@@ -329,9 +329,9 @@ class SemanticMap:
 
     # --- state ------------------------------------------------------------------------------------
     def adopt(self, other: "SemanticMap", objects: Objects) -> None:
-        """Replace regions and labels by those of another instance, and the objects by `objects`.
+        """Replace the regions and label requests by those of `other`, and the objects by `objects`.
 
-        The counters of this instance stay.
+        The counters of this instance do not change.
         """
         assert self.naming is not None
         assert other.naming is not None
@@ -340,7 +340,7 @@ class SemanticMap:
         self._sources = other._sources
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the state without the labels, which are stored in the map."""
+        """Return the state, except the labels of the Gaussians, which are a part of the map."""
         return {
             "vocabulary": self.vocabulary.pack(),
             "objects": self.objects.pack(),
@@ -370,8 +370,8 @@ class SemanticMap:
     def metrics(self) -> dict[str, float]:
         """Return the counters of the semantics.
 
-        The two `label_disagreement` metrics are those of the newest labelled keyframe, summed over
-        its Gaussians; see `gaussian_labels.Disagreement`.
+        The two `label_disagreement` metrics are sums over the Gaussians of the newest labelled
+        keyframe; see `gaussian_labels.Disagreement`.
         """
         labelled = 0
         if self._boxes:

@@ -38,8 +38,8 @@ class SemanticMapConfig:
         if self.max_waiting < 0 or self.max_remembered < 1 or self.max_names > MAX_LABELS:
             raise ConfigError(
                 named(self, "max_names", "max_waiting", "max_remembered")
-                + ": max_waiting must be at least 0, max_remembered at least 1, "
-                + f"max_names at most {MAX_LABELS}."
+                + ": max_waiting must be at least 0, max_remembered must be at least 1, and "
+                + f"max_names must be at most {MAX_LABELS}."
             )
 
     @property

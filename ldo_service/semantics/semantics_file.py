@@ -1,13 +1,13 @@
-"""File semantics.npz: the label distribution of each Gaussian of the map.ply of the same run.
+"""Reader and writer of semantics.npz, which has the label distribution of each Gaussian of a run.
 
-The arrays have the Gaussians in the order of map.ply.
+The file has C names of labels, and one row for each of the N Gaussians of map.ply, in its order:
 
 names     [C] text           names of the labels, by index: background, other, ...
-weights   [N, 5] float32     five highest probabilities, heaviest first; the rest is background
-ids       [N, 5] uint8       labels that the weights belong to; unused where the weight is 0
-evidence  [N] float32        sum of the weights of all observations, decayed with age
-extent_mm [N] uint16         size of the object at the last observation of a label
-misses    [N] uint8          keyframes since then that showed the Gaussian in no region
+weights   [N, 5] float32     five highest probabilities, highest first; background has the rest
+ids       [N, 5] uint8       indices of the labels with these probabilities; unused for weight 0
+evidence  [N] float32        sum of the weights of all label observations, decayed with age
+extent_mm [N] uint16         size of the object, mm, when a label was last observed
+misses    [N] uint8          keyframes after this observation that showed the Gaussian in no region
 """
 
 from dataclasses import dataclass
@@ -59,8 +59,8 @@ def read_semantics(path: Path, gaussians: int | None = None) -> SavedSemantics:
 
     Args:
         path: The file.
-        gaussians: Number of Gaussians in the map.ply of the same run, which the file must have too.
-            None: the number is not checked.
+        gaussians: Required number of Gaussians: that of the map.ply of the same run. None: the
+            number is not checked.
 
     Raises:
         DataError: If the file cannot be read, has another format, or has another number of
@@ -91,13 +91,13 @@ def _require(path: Path, name: str, values: np.ndarray, count: int) -> None:
     base, shape = ROW[name].base, (count, *ROW[name].shape)
     if values.dtype != base or values.shape != shape:
         raise DataError(
-            f"{path}: {name} is {values.dtype}{values.shape}, must be {base}{shape}. Use the "
-            "semantics.npz of a run."
+            f"{path}: the array {name} is {values.dtype}{values.shape}, but must be {base}{shape}. "
+            "Use the semantics.npz of a run."
         )
     if values.dtype.kind == "f" and not (np.isfinite(values).all() and (values >= 0).all()):
         raise DataError(
-            f"{path}: {name} has negative numbers, NaN or infinity; all must be finite and not "
-            "negative. Use the semantics.npz of a run."
+            f"{path}: the array {name} has negative numbers, NaN or infinity, but its numbers must "
+            "be finite and not negative. Use the semantics.npz of a run."
         )
 
 
@@ -106,6 +106,6 @@ def _require_names(path: Path, labels: np.ndarray, names: tuple[str, ...]) -> No
     last = int(rows["ids"][rows["weights"] > 0].max(initial=0))
     if not last < len(names) <= MAX_LABELS:
         raise DataError(
-            f"{path} has {len(names)} names and labels up to {last}; it must have {last + 1} to "
-            f"{MAX_LABELS} names. Use the semantics.npz of a run."
+            f"{path} has {len(names)} names of labels, but must have {last + 1} to {MAX_LABELS}, "
+            f"because its largest label index is {last}. Use the semantics.npz of a run."
         )

@@ -19,7 +19,7 @@ MIN_SCORE = 0.1  # Minimum score of a hit.
 
 
 class TextComparisonError(Exception):
-    """Failure of a comparison of texts by meaning; its message is a sentence with the reason."""
+    """Failure to compare texts by meaning; the error message is a sentence with the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,16 +35,16 @@ def search(
 ) -> list[SearchHit]:
     """Return the objects that match `text`, best first; equal scores keep the order of `objects`.
 
-    The score of an object is the maximum of p(name) nearness(name) over its names, where p(name) is
-    the probability that the object has this name. Objects with a score below 0.1 are omitted.
+    The score of an object is the maximum of p(name) * nearness(name) over its names. p(name) is the
+    probability that the object has this name. Objects with a score below 0.1 are omitted.
 
-    nearness(name) is 1 for `text` and its synonyms, and 0.9 for its hyponyms and hypernyms. If
-    `encode` is given, the nearness of any other name is the cosine between its vector and that of
-    `text`. A cosine below 0.85 counts as 0. Without `encode`, other names have the nearness 0.
+    nearness(name) is 1 for `text` and its synonyms, and 0.9 for its hyponyms and hypernyms. Any
+    other name is compared by `encode`: its nearness is the cosine between the vectors of the name
+    and of `text`. A cosine below 0.85 counts as 0. Without `encode`, other names have nearness 0.
 
     Args:
         text: Name to search for.
-        objects: For each object, its probabilities by name, 0..1.
+        objects: For each object, the probability of each of its names, 0..1.
         encode: Text encoder; None: names are compared by the vocabulary only.
 
     Raises:
@@ -65,7 +65,7 @@ def search(
 def text_similarity(
     text: str, names: Sequence[str], encode: Encode | None = None
 ) -> dict[str, float]:
-    """Return the nearness, 0..1, of names to `text`, by name; see `search` for its definition.
+    """Return the nearness, 0..1, of names to `text`, by name; `search` defines the nearness.
 
     Names with a nearness of 0 are omitted. The result also contains the synonyms, hyponyms and
     hypernyms of `text`, even if they are not in `names`.

@@ -34,7 +34,7 @@ class ActorStatus:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Problem of an actor that needs an action."""
+    """Problem of an actor, and the action that it requires from the user."""
 
     what: str  # Problem and consequence: a sentence whose subject, the actor, is left out.
     advice: str  # Action of the user.
@@ -48,7 +48,7 @@ def diagnose(seen: ActorStatus, heartbeat_s: float = 0.5) -> Iterator[Problem]:
 
     Args:
         seen: Observations of the actor.
-        heartbeat_s: Heartbeat period of the service.
+        heartbeat_s: Heartbeat period of the service, seconds.
     """
     if not seen.has_token and seen.health is None:
         yield Problem(

@@ -1,7 +1,7 @@
-"""Forecast for a service: resources per keyframe, and the bounds that it reaches first.
+"""Forecast for a service: resources per keyframe, and the limits that the service reaches first.
 
-A forecast continues the trend of some heartbeats, or of the files in a state folder. It knows
-nothing about the future of the camera, so it holds only while the camera moves as it did.
+A forecast continues the trend of some heartbeats, or of the files in a state folder. The forecast
+is valid only while the camera moves as during the time of these heartbeats or files.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -46,7 +46,7 @@ MEMORY_FULL = "the operating system may then kill a process of the service"
 
 @dataclass(frozen=True, slots=True)
 class Trend:
-    """Line through the values of one quantity."""
+    """Line that is fitted to the values of one quantity over time."""
 
     value: float  # Last value.
     per_s: float  # Slope per second; 0 if it may be scatter, or the effect of a single step.
@@ -55,9 +55,9 @@ class Trend:
     def of(times_s: Sequence[float], values: Sequence[float]) -> "Trend":
         """Fit a line by least squares.
 
-        One jump of the values, such as a saved state, does not tell when the next jump comes. If
-        one jump is more than half of the total change, parallel lines are therefore fitted to the
-        values before and after it.
+        A single jump of the values, for example after a state was saved, is no trend. If one jump
+        is more than half of the total change, parallel lines are fitted: one line to the values
+        before the jump, and one to the values after the jump.
 
         Args:
             times_s: Times of the values, seconds.
@@ -96,7 +96,7 @@ def _clear_slope(times_s: Sequence[np.ndarray], values: Sequence[np.ndarray]) ->
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """Bound that a service approaches."""
+    """Limit of a resource that a service approaches, and the effect of reaching the limit."""
 
     what: str
     consequence: str  # Effect of reaching the bound.
@@ -106,14 +106,14 @@ class Bound:
 
     @staticmethod
     def of(what: str, consequence: str, trend: Trend, limit: float, unit: str = "") -> "Bound":
-        """Return the bound of a quantity that grows up to a limit above zero."""
+        """Return the bound of a quantity that has the positive upper limit `limit`."""
         state = f"{trend.value:,.0f} of {limit:,.0f}{unit}"
         left = 0.0 if trend.value >= REACHED * limit else limit - trend.value
         return Bound(what, consequence, state, left, trend.per_s)
 
     @property
     def time_s(self) -> float:
-        """Seconds until the bound is reached; 0 if it is reached, infinity if it never is."""
+        """Seconds until the bound is reached: 0 if already reached, infinity if never reached."""
         if self.left <= 0:
             return 0.0
         return self.left / self.per_s if self.per_s > 0 else inf
@@ -125,7 +125,7 @@ class Bound:
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """Rates of a service, and the bounds that it reaches if these rates go on."""
+    """Growth rates of a service, and the bounds that the service reaches at these rates."""
 
     basis: str  # Source of the rates, and its time window.
     keyframes_per_s: float = 0.0
@@ -139,7 +139,7 @@ class Forecast:
 
     @property
     def reached(self) -> list[Bound]:
-        """Bounds that are reached within `HORIZON_S`, the first one first."""
+        """Bounds that are reached within 24 hours (`HORIZON_S`), the earliest first."""
         near = [bound for bound in self.bounds if bound.time_s <= HORIZON_S]
         return sorted(near, key=lambda bound: bound.time_s)
 
@@ -181,7 +181,7 @@ def _change(mb_per_s: float | None, times_s: float, of: str) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Return a duration in the largest unit of which it has at least one and a half."""
+    """Format a duration in hours if at least 1.5 h, in minutes if at least 1.5 min, else in s."""
     for unit_s, unit in ((3600.0, "h"), (60.0, "min")):
         if seconds >= 1.5 * unit_s:
             return f"{seconds / unit_s:.1f} {unit}"
@@ -198,10 +198,10 @@ class Heartbeats:
 
     @staticmethod
     def of(series: Iterable[tuple[float, Health]]) -> "Heartbeats":
-        """Take the heartbeats after the last restart of the actor from all of its heartbeats.
+        """Select the heartbeats of an actor after its last restart.
 
         Args:
-            series: Arrival time in seconds and heartbeat, ascending in time.
+            series: All heartbeats of the actor, as pairs of arrival time in seconds and heartbeat.
         """
         kept: list[tuple[float, Health]] = []
         was_restarted = False
@@ -226,17 +226,17 @@ class Heartbeats:
 
     @property
     def steps(self) -> int:
-        """Messages handled in this time."""
+        """Number of messages handled between the first and the last heartbeat."""
         return self.last.steps - self.health[0].steps
 
     def metric(self, name: str) -> Trend | None:
-        """Return the trend of a metric of the actor; None if it is not known."""
+        """Return the trend of a metric of the actor; None if no heartbeat has the metric."""
         known = [(t, h.metrics[name]) for t, h in zip(self.times_s, self.health, strict=True)
                  if name in h.metrics]  # fmt: skip
         return Trend.of(*zip(*known, strict=True)) if known else None
 
     def backlogs(self) -> Iterator[tuple[Trend, OutputCount]]:
-        """Yield the trend of the size of each output's backlog, MB, and the last counters."""
+        """Yield, for each output, the trend of its backlog size in MB, and its last counters."""
         for output in self.last.outputs:
             known = [
                 (at_s, count.backlog_mb)
@@ -256,10 +256,10 @@ def _life(health: Health) -> tuple[int, int, int]:
 
 
 def forecast(series: Mapping[str, Sequence[tuple[float, Health]]]) -> Forecast:
-    """Extrapolate the heartbeats of a service.
+    """Forecast the resources and bounds of a service from its heartbeats.
 
     Args:
-        series: Arrival time in seconds and heartbeat of each actor, ascending in time, by name.
+        series: For each actor by name, pairs of arrival time in seconds and heartbeat, in order.
     """
     actors = {name: Heartbeats.of(beats) for name, beats in series.items() if beats}
     enough = {name: h for name, h in actors.items() if len(h.health) >= MIN_VALUES}

@@ -1,7 +1,7 @@
 """Metrics of the health of all actors, for Prometheus.
 
-Counters restart from 0 with the process of their actor, as Prometheus expects. A silent actor keeps
-only its counters and the age of its last heartbeat.
+Counters of an actor restart from 0 when its process restarts, as Prometheus expects. An actor
+without recent heartbeats has only its counters and the age of its last heartbeat.
 """
 
 import time
@@ -199,7 +199,7 @@ class HealthCollector(Collector):
         return sorted({*self._actors} - heard)
 
     def failing_actors(self) -> list[str]:
-        """Return the names of the actors whose heartbeat says `failing`."""
+        """Return the names of the actors that failed on each of their last three messages."""
         with self._lock:
             return sorted(actor for actor, (_, health) in self._last.items() if health.failing)
 
@@ -235,7 +235,7 @@ class HealthCollector(Collector):
         return age
 
     def warnings(self) -> Iterator[str]:
-        """Yield a description of each problem that does not affect the service now."""
+        """Yield a description of each problem that does not affect the service yet."""
         if expiry := expiry_warning(self.certificate_until_s):
             yield f"the certificate of the service {expiry}"
         age_s = self.generation_age_s() if self.generation_age_s else 0.0

@@ -1,16 +1,17 @@
 """HTTP server with the health of all actors: `ldo serve --metrics-port PORT`.
 
-It listens on loopback by default.
+The server listens on loopback by default.
 
-- `/metrics`: Metrics of the health messages for Prometheus. Counters restart from 0 with the
-  process of their actor, as Prometheus expects. A silent actor keeps only its counters and the age
-  of its last heartbeat.
-- `/healthz`: 200 while every actor sends heartbeats, else 503 with the names of the silent actors.
-  The reply describes only the current state.
-- `/readyz`: 200 while no actor is silent and no actor fails on every message, else 503 with the
-  names of these actors. A restart of the service does not help an actor that fails. The reply
-  also warns, without another status, of a certificate that expires within 30 days. It warns too if
-  the generation of the states to which the service falls back is out of date for a minute.
+- `/metrics`: Metrics of the health messages for Prometheus. Counters of an actor restart from 0
+  when its process restarts, as Prometheus expects. An actor without recent heartbeats has only its
+  counters and the age of its last heartbeat.
+- `/healthz`: Status 200 while every actor sends heartbeats, else 503 with the names of the actors
+  without recent heartbeats. The reply describes only the current state.
+- `/readyz`: Status 200 while every actor sends heartbeats and no actor fails on every message, else
+  503 with the names of the actors that are silent or fail. A restart does not help an actor that
+  fails.
+- `/readyz` also warns, with unchanged status, if the certificate expires within 30 days, or if the
+  older copy of the actors' states (generation) is more than a minute out of date.
 """
 
 import socket
@@ -81,7 +82,7 @@ def serve_metrics(collector: HealthCollector, port: int, address: str = LOOPBACK
     """Serve http://ADDRESS:PORT/metrics, /healthz and /readyz inside the block.
 
     Raises:
-        ConfigError: The port is no port number.
+        ConfigError: The port is not within 1..65535.
         UnavailableError: The server cannot listen on the address and port.
     """
     if not 0 < port < 65536:

@@ -1,8 +1,8 @@
-"""Live service: every actor as a stage in this process or in a child process.
+"""Live service, which runs every actor in the main process or in a child process.
 
 The main process opens the router that all other processes connect to. It starts and supervises the
-child processes. Each one runs `ldo serve --actor ACTOR` with the same configuration and state
-folder.
+child processes. Each child process runs `ldo serve --actor ACTOR` with the same configuration and
+state folder.
 """
 
 import asyncio
@@ -108,7 +108,7 @@ def open_recorder(
 
 @dataclass(frozen=True, slots=True)
 class Service:
-    """Process of a live service: its main process, or one that runs only some of its actors."""
+    """Process of a live service: the main process, or a process with some of the actors only."""
 
     config: Config
     network: Endpoint

@@ -41,11 +41,11 @@ def state_folder(folder: Path | None, stack: ExitStack) -> Path:
     """Check or create the state folder.
 
     Args:
-        folder: The folder; None for a temporary one that is deleted with `stack`.
+        folder: The folder. None: a temporary folder is created, and deleted when `stack` closes.
         stack: Exit stack that is closed when the service ends.
 
     Returns:
-        The folder, which exists.
+        The path of the folder.
 
     Raises:
         ConfigError: The path is no folder, or the folder contains a run or a recording.
@@ -89,9 +89,9 @@ def claim_state(folder: Path, stack: ExitStack, remote_actors: Collection[str] =
     """Lock the folder for this service, and check that the states of all actors match.
 
     The states of the actors refer to the same keyframe ids and graph versions. If one state were
-    missing or older, the service would connect keyframes of two different runs. If a state is
-    damaged, or if the states do not match, all actors fall back to the last complete generation, a
-    synced copy of all states (`runtime.generations`).
+    missing or older, the service would connect keyframes of two different runs. A generation is a
+    synced copy of all states; see `runtime.generations`. If a state is damaged, or if the states do
+    not match, all actors fall back to the last complete generation.
 
     Args:
         folder: The state folder.
@@ -102,8 +102,8 @@ def claim_state(folder: Path, stack: ExitStack, remote_actors: Collection[str] =
         ConfigError: The states do not match, and there is no older generation.
         UnavailableError: Another service uses the folder, or it cannot be read or written now.
         DamagedStateError: A state is damaged, and there is no undamaged older generation.
-        DataError: A state cannot be read because of a limit of the process, or another version of
-            the service wrote it.
+        DataError: A state cannot be read because the process has reached a limit, such as that of
+            open files, or because another version of the service wrote the state.
     """
     try:
         lock = stack.enter_context((folder / "lock").open("w"))

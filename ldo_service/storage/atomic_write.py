@@ -3,7 +3,7 @@
 The content is first written to a temporary file or folder next to the target. A rename then
 replaces the target, so a reader sees the whole old content or the whole new content. A failed write
 removes the temporary file or folder; a killed process may leave it. The name of a temporary file
-ends in `UNFINISHED`, and the name of a temporary folder begins with it.
+ends in `.new`, and the name of a temporary folder begins with `.new-`.
 """
 
 import os
@@ -51,9 +51,9 @@ def write_atomically(path: Path, *parts: bytes, syncs: bool = False, unique: boo
 
 @contextmanager
 def folder_made_atomically(path: Path) -> Iterator[Path]:
-    """Yield a temporary path, and rename the folder created there to `path` after the block.
+    """Yield a temporary path for a folder, and rename this folder to `path` after the block.
 
-    The block must create the folder.
+    The block must create the folder at the temporary path.
 
     Raises:
         OSError: The folder cannot be created; no part of it remains.
@@ -77,14 +77,14 @@ def make_folder(path: Path) -> None:
 
 
 def sync_all(paths: Iterable[Path]) -> None:
-    """Sync files and folders, without those that were removed meanwhile."""
+    """Sync files and folders to the disk, and skip paths that do not exist any more."""
     for path in paths:
         with suppress(FileNotFoundError):
             sync(path)
 
 
 def with_folders(files: Iterable[Path]) -> list[Path]:
-    """Return files, and then their folders, which must be synced too if the files are new."""
+    """Return files and then their folders, because the folder of a new file must be synced too."""
     files = list(files)
     return [*files, *dict.fromkeys(file.parent for file in files)]
 

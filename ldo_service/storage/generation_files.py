@@ -1,7 +1,7 @@
-"""Files of one generation of an actor's state, which are copied and synced to the disk.
+"""Copies of the files of an actor's state for a generation.
 
-A generation is a copy of the states of all actors, to which the service falls back; see
-`runtime.generations`.
+A generation is a synced copy of the states of all actors. The service falls back to a generation if
+the current states are damaged; see `runtime.generations`.
 """
 
 from dataclasses import dataclass, field
@@ -17,9 +17,9 @@ from .state_contents import StateContents, check_of
 class GenerationFiles:
     """Files of one actor that a generation adds to the disk; any thread may call `write`.
 
-    A generation is a copy of the saved states of all actors at one time, to which the service can
-    fall back. It has copies of its own, so that a damaged file of the current state leaves it
-    whole. A part that did not change since the last complete generation is not copied again.
+    A generation is a copy of the saved states of all actors, to which the service can fall back.
+    The generation has its own files, so damage to a file of the current state does not affect the
+    generation. A part that did not change since the last complete generation is not copied again.
     """
 
     folder: Path  # Folder of the actor's state.
@@ -35,7 +35,7 @@ class GenerationFiles:
 
         Raises:
             DamagedStateError: A file does not match its checksum.
-            OSError: A file cannot be read or written, or the generation was given up.
+            OSError: A file cannot be read or written, or the generation is not needed any more.
         """
         if not self.list_name:
             return

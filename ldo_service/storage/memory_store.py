@@ -1,4 +1,4 @@
-"""Store of the last state of each actor in memory."""
+"""Store that holds the last state of each actor in memory."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -7,7 +7,7 @@ from .state_store import State
 
 
 class MemoryStore:
-    """Store in memory; the states are lost when the process ends, but not when an actor fails."""
+    """Store of states in memory; they outlive a failure of their actor, but not the process."""
 
     # The states do not survive a power cut, and have no generations.
     syncs = has_generations = False
@@ -20,7 +20,7 @@ class MemoryStore:
         return
 
     def quarantine_folder(self, actor: str) -> None:  # noqa: ARG002
-        """Return None: memory cannot keep a record of messages that end the process."""
+        """Return None, because messages that end the process cannot be kept in its memory."""
         return
 
     def save(self, actor: str, state: State, unsynced: Iterable[Path] = ()) -> None:  # noqa: ARG002
@@ -43,16 +43,16 @@ class MemoryStore:
         completed: int,  # noqa: ARG002
         unsynced: Iterable[Path] = (),  # noqa: ARG002
     ) -> None:
-        """Keep no generation (synced copy of all states): memory does not survive the process."""
+        """Do nothing, because a store in memory has no generations (copies of states on disk)."""
         return
 
     def is_kept(self, actor: str) -> bool:  # noqa: ARG002
-        """Return False, because no generation of the state is kept."""
+        """Return False, because a store in memory keeps no older copies of the states."""
         return False
 
     def give_up(self, actor: str) -> None:
-        """Do nothing, because no generations exist that could be deleted."""
+        """Do nothing, because a store in memory has no older copies of the states to delete."""
 
     def has_fallen_back(self, actor: str) -> bool:  # noqa: ARG002
-        """Return False, because no older state is kept that could replace a damaged one."""
+        """Return False, because this store has no older states that could replace damaged ones."""
         return False

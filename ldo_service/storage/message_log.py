@@ -24,7 +24,7 @@ _RECORD = struct.Struct("<QIII")
 
 
 class LoggedMessage(NamedTuple):
-    """Message of a log."""
+    """Message that a `MessageLog` stores."""
 
     seq: int  # Number of the message.
     header: bytes  # Encoded header.
@@ -55,8 +55,9 @@ class MessageLog:
     The numbers of the messages are consecutive, except where messages were lost, for example in a
     power cut.
 
-    The oldest messages are deleted when the log exceeds its maximum size. The numbers of the
-    messages belong to one epoch of their producer. Files of other epochs are deleted.
+    The oldest messages are deleted when the log exceeds its maximum size. A producer that begins
+    without a saved state takes a new epoch number, and counts its messages from 0 again. The log
+    has messages of one epoch, and deletes files of other epochs.
     """
 
     def __init__(
@@ -169,8 +170,8 @@ class MessageLog:
     def pop_unsynced(self) -> list[Path]:
         """Return the files written since the last call, and their folders.
 
-        The next call does not return them again. The caller must therefore sync them, and retry if
-        that fails.
+        The next call does not return these files again. The caller must therefore sync them, and
+        must retry a failed sync.
         """
         with self._lock:
             paths = sorted(self._unsynced)
@@ -221,12 +222,12 @@ class MessageLog:
         return min(later, default=end)
 
     def forget(self, before: int, handled: int = 0) -> None:
-        """Delete the segments that only hold messages with numbers below `before`.
+        """Delete the files of the log that only have messages with numbers below `before`.
 
         Args:
-            before: Number of the first message that a consumer or a generation of the states needs.
-            handled: All consumers have handled the messages before this number. These messages do
-                not count as dropped if the log exceeds its maximum size.
+            before: Number of the first message that a consumer or a copy of the states still needs.
+            handled: All consumers have handled the messages before this number. If the log exceeds
+                its maximum size and deletes these messages, they do not count as dropped.
         """
         with self._lock:
             self._first, self._handled = max(self._first, before), max(self._handled, handled)

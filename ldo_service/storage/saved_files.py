@@ -1,4 +1,4 @@
-"""Files of a saved state while its actor does not run: checked and synced at start and stop."""
+"""Check and sync of the files of a saved state when the service starts or stops."""
 
 import msgspec
 
@@ -11,7 +11,7 @@ from .state_store import CONTENTS, NEWEST, FolderStore, list_name
 
 
 class SavedFiles:
-    """Files of the saved state of one actor, which must not run."""
+    """Files of the saved state of one actor; the actor must not run during any call."""
 
     def __init__(self, store: FolderStore, actor: str) -> None:
         """Initialize without reading any file.
@@ -27,11 +27,11 @@ class SavedFiles:
     def check_unsynced(self, generation: int = NEWEST) -> None:
         """Check the files that were possibly not synced to the disk when the state was saved.
 
-        They are outside the folder of the state, and a power cut may have damaged them.
+        These files are outside the folder of the state. A power cut may have damaged them.
 
         Args:
-            generation: Number of a generation of the states; by default the state after the last
-                step.
+            generation: Number of the generation (older copy of the states) whose files are checked.
+                By default, the files of the state after the last step are checked.
 
         Raises:
             DamagedStateError: A file is missing or damaged.

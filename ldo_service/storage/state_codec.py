@@ -47,7 +47,7 @@ def _array_to_ext(value: object) -> msgspec.msgpack.Ext:
 
 def _array_from_ext(code: int, data: memoryview) -> Any:
     if code != ARRAY_CODE:
-        raise ValueError(f"MessagePack extension {code} is unknown; only {ARRAY_CODE} is an array")
+        raise ValueError(f"MessagePack extension type {code} must be {ARRAY_CODE}, a NumPy array")
     dtype, shape, raw = msgspec.msgpack.decode(data, type=tuple[str, tuple[int, ...], bytes])
     array = np.frombuffer(raw, dtype).reshape(shape).copy()
     return array if shape else array[()]

@@ -36,7 +36,7 @@ class StateContents(msgspec.Struct, frozen=True):
     checksum: int = 0  # CRC-32 of the encoded contents with checksum 0.
 
     def encode(self) -> bytes:
-        """Return the content of the file, with its checksum."""
+        """Encode this list of files with its checksum, for the file on disk."""
         return msgspec.msgpack.encode(msgspec.structs.replace(self, checksum=self._checksum()))
 
     def _checksum(self) -> int:
@@ -49,7 +49,7 @@ class StateContents(msgspec.Struct, frozen=True):
         return self.version != STATE_VERSION and own._checksum() == self.checksum
 
     def read_part(self, folder: Path, part: str) -> Any:
-        """Read a part, and compare it with its size and checksum.
+        """Read a part of the state from its file, and check size and checksum of the file.
 
         Raises:
             FileNotFoundError: The file is missing.
@@ -65,12 +65,12 @@ class StateContents(msgspec.Struct, frozen=True):
 
 
 def check_of(body: bytes) -> tuple[int, int]:
-    """Return size in bytes and CRC-32 of a file."""
+    """Return size in bytes and CRC-32 of the content of a file."""
     return len(body), zlib.crc32(body)
 
 
 def read_contents(path: Path) -> StateContents | None:
-    """Read a list of files; None if it does not exist.
+    """Read the list of the files of a state; return None if the list does not exist.
 
     Raises:
         DamagedStateError: The list is damaged.

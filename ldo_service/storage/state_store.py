@@ -1,7 +1,7 @@
 """Stores of the last state of each actor, from which a restored actor continues.
 
-A state consists of a few named parts. A store skips a part that is the same Python object as in the
-last save. Callers must therefore never modify a part that was saved; they replace it.
+A state consists of a few named parts. `save` does not write a part that is the same Python object
+as in the last save. A caller that changes a saved part must therefore replace it by a new object.
 """
 
 import errno
@@ -47,7 +47,7 @@ class StateStore(Protocol):
         ...
 
     def quarantine_folder(self, actor: str) -> Path | None:
-        """Return the folder for messages that end an actor's process.
+        """Return the folder for messages that repeatedly ended the process of an actor.
 
         Returns:
             The folder; None if the store is in memory, because memory is lost with the process.
@@ -69,33 +69,33 @@ class StateStore(Protocol):
     def keep(
         self, actor: str, generation: int, completed: int, unsynced: Iterable[Path] = ()
     ) -> GenerationFiles | None:
-        """Keep the last saved state as a generation; see `FolderStore.keep`."""
+        """Keep a copy of the last saved state as a generation; see `FolderStore.keep`."""
         ...
 
     def is_kept(self, actor: str) -> bool:
-        """Return whether the actor's state has a generation, to which the service can fall back."""
+        """Return whether an older copy (generation) of the actor's state exists."""
         ...
 
     def give_up(self, actor: str) -> None:
-        """Delete all generations of an actor's state, but keep the state after the last step."""
+        """Delete all older copies (generations) of an actor's state, but not its newest state."""
         ...
 
     def has_fallen_back(self, actor: str) -> bool:
-        """Return whether the last loaded state is one to which the service has fallen back."""
+        """Return whether the last loaded state of an actor is an older copy (generation)."""
         ...
 
 
 class FolderStore:
-    """Store in files of a folder `<folder>/<actor>/`, which survive a killed process.
+    """Store on disk, with a folder `<folder>/<actor>/` for the state of each actor.
 
     Each part has a file that is never changed, and `contents.msgpack` lists the files of the
     current state with their sizes and checksums. A changed part is written to a new file. The list
     is replaced last, by one rename. A reader therefore finds the whole old state or the whole new
     state, or detects the damage.
 
-    A power cut may damage files that are not synced. `keep` therefore keeps synced copies of the
-    current state as an older generation, in the list `generation-<number>.msgpack`. The states of
-    all actors in one generation belong together; see `runtime.generations`.
+    A power cut may damage files that are not synced. `keep` therefore makes a generation: synced
+    copies of the files of the current state, with the list `generation-<number>.msgpack`. The
+    states of all actors in one generation belong together; see `runtime.generations`.
     """
 
     def __init__(self, folder: Path, *, syncs: bool = False, has_generations: bool = True) -> None:
@@ -121,7 +121,7 @@ class FolderStore:
         return self.folder / f"{actor}.backlog"
 
     def quarantine_folder(self, actor: str) -> Path:
-        """Return the folder for messages that end an actor's process."""
+        """Return the folder for messages that repeatedly ended the process of an actor."""
         return self.folder / f"{actor}.quarantine"
 
     # --- current state ----------------------------------------------------------------------------
@@ -197,7 +197,7 @@ class FolderStore:
 
         Args:
             actor: Name of the actor.
-            generation: Number of a generation; by default the state after the last step.
+            generation: Number of an older copy to load; by default the newest state is loaded.
             prefixes: Load only the parts whose names begin with one of these prefixes.
 
         Returns:
@@ -292,17 +292,18 @@ class FolderStore:
     def keep(
         self, actor: str, generation: int, completed: int, unsynced: Iterable[Path] = ()
     ) -> GenerationFiles:
-        """Keep the last saved state as a generation, and forget all others except `completed`.
+        """Keep the last saved state as a generation; delete older ones except `completed`.
 
         Args:
             actor: Name of the actor.
-            generation: Number of the generation, which no earlier one has.
+            generation: Number of the new generation, which no earlier generation has.
             completed: Number of the newest generation that all actors have completed.
-            unsynced: Those of the files given to `save` that are not synced to the disk yet. The
-                caller must sync them.
+            unsynced: Files that were given to `save` and are not synced to the disk yet. The caller
+                must sync them.
 
         Returns:
-            The files of the generation, which the caller must write.
+            The files of the generation. They are complete on disk after a call of
+            `GenerationFiles.write`.
 
         Raises:
             OSError: A file cannot be read.
@@ -336,7 +337,7 @@ class FolderStore:
         return new
 
     def give_up(self, actor: str) -> None:
-        """Delete all generations of an actor's state, but keep the state after the last step.
+        """Delete all older copies (generations) of an actor's state, but not its newest state.
 
         Raises:
             OSError: The disk cannot be written.
@@ -357,19 +358,19 @@ class FolderStore:
             self._remove_unused(actor, copies)
 
     def exists(self, actor: str, generation: int = NEWEST) -> bool:
-        """Return whether an actor has a state in a generation; NEWEST is that of its last step."""
+        """Return whether an actor has a state in a generation, or a newest state for NEWEST."""
         return (self.folder / actor / list_name(generation)).exists()
 
     def is_kept(self, actor: str) -> bool:
-        """Return whether the actor's state has a generation, to which the service can fall back."""
+        """Return whether an older copy (generation) of the actor's state exists."""
         if actor in self._kept:
             return bool(self._kept[actor])
         return any((self.folder / actor).glob(GENERATION.format("*")))
 
     def fall_back(self, actor: str, generation: int) -> None:
-        """Replace the state of an actor by that of a generation.
+        """Replace the newest state of an actor by its state in a generation (older copy).
 
-        If the actor has no state in that generation, its state is deleted.
+        If the actor has no state in the generation, the newest state is deleted.
 
         Raises:
             OSError: The state cannot be written.
@@ -385,7 +386,7 @@ class FolderStore:
             write_atomically(folder / CONTENTS, contents.encode(), syncs=True)
 
     def has_fallen_back(self, actor: str) -> bool:
-        """Return whether the last loaded state is one to which the service has fallen back."""
+        """Return whether the last loaded state of an actor is an older copy (generation)."""
         return actor in self._fallen_back
 
 

@@ -1,7 +1,7 @@
-"""Reading and writing of plain values as YAML, for files that users write.
+"""Reading and writing of YAML files that users write.
 
-Numbers with an exponent follow YAML 1.2. PyYAML reads YAML 1.1, where `2e-4` is text because it has
-no decimal point.
+This module reads `2e-4` as a number, as YAML 1.2 requires. PyYAML itself follows YAML 1.1, which
+reads `2e-4` as text because the decimal point is missing.
 """
 
 import re
@@ -27,8 +27,8 @@ for _one in (_Loader, _Dumper):
 def load_yaml(text: str | bytes) -> Any:
     """Parse YAML into numbers, text, dates, lists and dictionaries.
 
-    PyYAML's parser in Python is used, because libyaml (C) overflows its stack on deeply nested
-    brackets.
+    The function uses PyYAML's pure-Python parser, because libyaml (C) overflows its stack on deeply
+    nested brackets.
 
     Raises:
         yaml.YAMLError: The text is malformed; the message has one line. No other exception occurs.
@@ -36,7 +36,7 @@ def load_yaml(text: str | bytes) -> Any:
     try:
         return _loaded(text)
     except RecursionError:
-        raise yaml.YAMLError("the content is nested too deeply") from None
+        raise yaml.YAMLError("the YAML is nested too deeply; use fewer levels") from None
     except (yaml.YAMLError, ValueError) as error:  # A date such as 2027-13-01 is a ValueError.
         raise yaml.YAMLError(" ".join(str(error).split())) from error
 
@@ -53,7 +53,7 @@ def dump_yaml(values: Any, *, flow: bool | None = False, width: float = 80) -> s
     """Write values as YAML that `load_yaml` reads back unchanged.
 
     Args:
-        values: Plain values.
+        values: Numbers, text, dates, lists and dictionaries.
         flow: True: all values on one line. None: one line per innermost list or dictionary. False:
             one line per value.
         width: Maximum line width in columns.

@@ -1,8 +1,8 @@
 """Suites: runs of several sequences, variants and seeds, evaluated and compared in a table.
 
 The YAML files of this package are built-in suites. They reproduce the tables of the LDO-SLAM paper,
-including the sensitivity analysis and the ablation. The key `published` has the values from the
-paper, for the paper's method and for other methods.
+including the sensitivity analysis and the ablation. The key `published` holds the numbers that
+the paper reports, for its own method and for other methods.
 """
 
 from .runner import Outcome, SuiteRunner

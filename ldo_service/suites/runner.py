@@ -32,8 +32,8 @@ class Outcome:
 
     Attributes:
         entry: The run.
-        evaluated: Results of the run; None if there are none.
-        missing: Reason why there are no results, as printed in the table.
+        evaluated: Results of the run; None if the run has no results.
+        missing: Text that the table shows in place of results, such as "no data".
     """
 
     entry: SuiteRun
@@ -47,12 +47,12 @@ class SuiteRunner:
 
     Attributes:
         suite: The suite.
-        data: Folder with the sources.
-        out: Folder for the runs.
-        settings: Settings of all runs; the settings of a variant override these.
+        data: Folder with the data sets.
+        out: Folder for the results of the runs.
+        settings: Settings of all runs; a variant can override them.
         overwrite: True to repeat finished runs too.
-        workers: Number of runs at the same time. Each run uses one core, or all cores if this
-            number is 1.
+        workers: Number of runs at the same time. A single worker uses all cores; several workers
+            use one core each.
     """
 
     suite: Suite
@@ -109,7 +109,7 @@ class SuiteRunner:
                     yield job
 
     def job(self, entry: SuiteRun, recording: Recording) -> BatchJob:
-        """Return the job of a run."""
+        """Return the batch job that executes a run."""
         records = self.suite.front_end is not None and entry.front_end is None
         reused = entry.front_end_folder
         plan = self._plan(entry.settings)

@@ -62,19 +62,22 @@ class EvaluatedRun:
         return self.results["labels"][-1]["lists"]["COCO"]["from 0.2 %"]
 
     def consistency(self) -> float | None:
-        """Return the label consistency of the newest map; None if no pixel was compared."""
+        """Return the fraction of object pixels with equal labels in two views of the newest map.
+
+        The value is None if no pixel was compared.
+        """
         return self.results["labels"][-1]["consistency"]
 
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Metric of a table.
+    """Metric that a table of results shows.
 
     Attributes:
         title: Title of the column.
         form: Format specification of the value, such as ".2f".
-        read: Function that returns the value of a run. If the run has none, it returns None or
-            raises KeyError, IndexError or TypeError.
+        read: Function that returns the metric of a run. For a run without this metric, the function
+            returns None or raises KeyError, IndexError or TypeError.
     """
 
     title: str
@@ -82,7 +85,7 @@ class Score:
     read: Callable[[EvaluatedRun], float | None]
 
     def of(self, evaluated: EvaluatedRun) -> float | None:
-        """Return the value of a run; None if the run has none."""
+        """Return the metric of a run; None if the run lacks this metric."""
         try:
             return self.read(evaluated)
         except (KeyError, IndexError, TypeError):
@@ -136,7 +139,7 @@ FIGURES: dict[str, Score] = {
 
 @dataclass(frozen=True, slots=True)
 class SuiteRun:
-    """One run of a suite: the names of its sequence and variant, its source and its settings."""
+    """One run of a suite: one variant of the settings on one sequence."""
 
     sequence: str
     variant: str
@@ -154,7 +157,7 @@ class SuiteRun:
 
     @property
     def front_end_folder(self) -> Path | None:
-        """Folder of the run whose recorded front end this run uses; None if it uses none."""
+        """Folder of the run whose tracker and detector outputs this run reuses, or None."""
         return self._folder_of(self.front_end) if self.front_end else None
 
     def _folder_of(self, variant: str) -> Path:
@@ -166,8 +169,8 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     """Content of a suite file.
 
     Raises:
-        ConfigError: A required list is empty, a name of a sequence or variant is not usable as a
-            folder name, a metric is unknown, or `front_end` is invalid.
+        ConfigError: A required list is empty, a sequence or variant name cannot be a folder name, a
+            metric is unknown, or `front_end` is invalid.
     """
 
     title: str  # Title of the tables.
@@ -199,8 +202,8 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         for name in (*self.sequences, *self.variants):
             if not NAME.fullmatch(name):
                 raise ConfigError(
-                    f"the name {name!r} of a sequence or variant must be usable as the name of a "
-                    "folder. Use letters, digits, spaces and any of . _ + -"
+                    f"the sequence or variant name {name!r} must be usable as a folder name. Use "
+                    "letters, digits, spaces and the characters . _ + -"
                 )
         if self.front_end not in (None, next(iter(self.variants))):
             raise ConfigError(
@@ -216,8 +219,9 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         of_front_end = sorted(OF_FRONT_END.intersection(self.figures))
         if self.front_end and of_front_end:
             raise ConfigError(
-                f"{of_front_end[0]} depends on the front end, which all variants reuse from "
-                f"{self.front_end!r}. Remove {of_front_end[0]} from figures, or remove front_end."
+                f"{of_front_end[0]} depends on the tracker and detector, whose outputs all "
+                f"variants reuse from {self.front_end!r}. Remove {of_front_end[0]} from figures, "
+                "or remove front_end."
             )
 
     def entries(self, data: Path) -> Iterator[SuiteRun]:
@@ -238,7 +242,7 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
                     yield SuiteRun(sequence, variant, where, settings, seed, front_end)
 
     def front_end_settings(self) -> tuple[str, ...] | None:
-        """Return the settings of the variant `front_end`; None if `front_end` is None."""
+        """Return the settings of the variant named by `front_end`; None if `front_end` is None."""
         return None if self.front_end is None else self.variants[self.front_end]
 
     def options(self) -> list[str]:

@@ -7,20 +7,20 @@ products differ between machines.
 
 Sequences:
 
-- `room`, `tour`: One furnished room, rendered when read.
+- `room`, `tour`: One furnished room. The sequence `tour` is longer and shows all four walls.
 - `person`: The same room, with a person who walks through it.
 - `room-noisy`, `tour-noisy`, `person-noisy`: The sequences above with the depth errors of a Kinect.
 - `flat`: Two rooms and a corridor with ground-truth labels, designed to be hard for SLAM.
 - `twins`: Four offices along a corridor that look alike and differ only in their objects.
-- `corridor`: A long corridor with weak texture, equal doors and few objects, walked to its end and
-  back.
+- `corridor`: A walk to the end of a long corridor and back, with weak texture, identical doors and
+  few objects.
 - `flat-exact`, `twins-exact`, `corridor-exact`: The same scenes without motion blur, noise and
   other sensor errors.
-- `room-handheld`, `tour-handheld`, `person-handheld`, `flat-handheld`: Faster motion, seen by a
-  camera with simulated effects of real cameras, such as motion blur. All effects are on by default.
-  A colon and effect names joined by `+` select some: `tour-handheld:rolling-shutter+stereo`.
+- `room-handheld`, `tour-handheld`, `person-handheld`, `flat-handheld`: Faster motion, with
+  simulated effects of real cameras such as motion blur. All effects are on by default. Names after
+  a colon, joined by `+`, select single effects: `tour-handheld:rolling-shutter+stereo`.
 
-A number after @ is the seed of textures, hand shake and noise, as in `room@3`; the default is 0.
+A number after @, as in `room@3`, is the seed of textures, hand shake and noise. The default is 0.
 """
 
 from ldo_service.errors import DataError

@@ -40,7 +40,10 @@ def shade(
 
 
 def plane_axes(axis: int) -> tuple[int, int]:
-    """Return the two axes that span a face normal to `axis`; on walls the second one is z."""
+    """Return the two axes that span a face perpendicular to `axis`.
+
+    On walls, the second of the two axes is z.
+    """
     return ((1, 2), (0, 2), (0, 1))[axis]
 
 
@@ -135,7 +138,10 @@ def _is_between(solid: Solid, point: Vector, lamp_m: Vector) -> np.ndarray:
 
 
 def interpolated(grid: np.ndarray, u_m: np.ndarray, v_m: np.ndarray) -> np.ndarray:
-    """Interpolate a grid with cells of LIGHT_CELL_M bilinearly at u_m, v_m [P]; return [P]."""
+    """Return the light [P] at grid coordinates u_m, v_m [P], interpolated bilinearly.
+
+    The cells of the grid have the size LIGHT_CELL_M.
+    """
     x, y = u_m / LIGHT_CELL_M, v_m / LIGHT_CELL_M
     column = np.clip(x.astype(np.int64), 0, grid.shape[1] - 2)
     row = np.clip(y.astype(np.int64), 0, grid.shape[0] - 2)

@@ -97,7 +97,7 @@ SWAY_TARGET_M = 0.03
 
 
 def poses(path: Path, count: int, seed: int) -> np.ndarray:
-    """Return T_world_camera [count, 4, 4] for one turn on a path; `seed` sets the hand shake."""
+    """Return T_world_camera [count, 4, 4] for a round on a path; `seed` sets the hand shake."""
     rng = np.random.default_rng(seed)
     along = np.arange(count) * (len(path.eyes_m) / count)
     eyes = closed_spline(path.eyes_m, along) + _sway(rng, count, SWAY_EYE_M)
@@ -106,7 +106,7 @@ def poses(path: Path, count: int, seed: int) -> np.ndarray:
 
 
 def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return T_world_camera [4, 4] at `eye`, with z toward `target` and a level horizon."""
+    """Return T_world_camera [4, 4] at `eye`, with z axis toward `target` and a level horizon."""
     z = _unit(target - eye)
     x = _unit(np.array([z[1], -z[0], 0.0]))
     y = np.array([z[1] * x[2] - z[2] * x[1], z[2] * x[0] - z[0] * x[2], z[0] * x[1] - z[1] * x[0]])
@@ -116,7 +116,7 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def looking(eyes: np.ndarray, gazes: np.ndarray, rolls: np.ndarray) -> np.ndarray:
-    """Return T_world_camera [N, 4, 4] with z along the gaze, rolled by small angles.
+    """Return T_world_camera [N, 4, 4] with the z axis along the gaze, rolled by small angles.
 
     Args:
         eyes: Camera centers [N, 3].

@@ -49,7 +49,7 @@ class Renderer:
 
         Args:
             camera: Intrinsics.
-            T_world_camera: Camera pose [4, 4], or one for each row, [H, 4, 4].
+            T_world_camera: Camera pose [4, 4], or one pose for each image row, [H, 4, 4].
             visitors: Solids in addition to the furniture; they cast no shadow.
         """
         v, u = np.divmod(np.arange(camera.width * camera.height), camera.width)

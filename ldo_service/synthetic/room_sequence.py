@@ -39,7 +39,7 @@ def kinect_depth(depth_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         rng: Source of the noise of the pattern matching.
 
     Returns:
-        Measured depth [H, W], meters; 0 outside the range and in the projector's shadow.
+        Measured depth [H, W], meters; 0 outside 0.4 to 8 m and in the projector's shadow.
     """
     disparity = 1 / (depth_m * DISPARITY_STEP_PER_M)
     disparity = disparity + DISPARITY_SIGMA_STEPS * rng.standard_normal(depth_m.shape)
@@ -59,7 +59,7 @@ def _is_shadowed(depth_m: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class SyntheticConfig:
-    """Parameters of a rendered sequence; equal values give equal bytes."""
+    """Parameters of a rendered sequence; equal parameters give bitwise equal images."""
 
     frames: int = 120
     width_px: int = 320
@@ -74,7 +74,7 @@ class SyntheticConfig:
         if self.frames < 1 or self.width_px < 8 or self.height_px < 8:
             raise ConfigError(
                 f"the synthetic sequence has {self.frames} frames of "
-                f"{self.width_px}x{self.height_px} pixels, must have at least 1 frame of 8x8 "
+                f"{self.width_px}x{self.height_px} pixels, but must have at least 1 frame of 8x8 "
                 "pixels."
             )
         if self.path not in PATHS:
@@ -94,7 +94,7 @@ NAMED = {
 
 
 class SyntheticSequence(Sequence):
-    """Sequence of the furnished room, rendered when read; depth is float32 in meters."""
+    """Sequence of the furnished room. Each read renders the frame; depth is float32 in meters."""
 
     def __init__(self, config: SyntheticConfig | None = None, name: str = "synthetic") -> None:
         self.config = config = config or SyntheticConfig()

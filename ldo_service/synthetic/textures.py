@@ -84,8 +84,8 @@ def noise(
 ) -> np.ndarray:
     """Return a tile of noise in -1..1, [TILE_TEXELS, TILE_TEXELS].
 
-    Each octave has half the amplitude of the previous octave. The spectra of photographs fall in a
-    similar way.
+    Each octave has half the amplitude of the previous octave. The spectra of photographs fall with
+    frequency in a similar way.
 
     Args:
         rng: Source of the noise.

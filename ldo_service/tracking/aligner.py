@@ -32,13 +32,13 @@ Found = TypeVar("Found")
 class Aligner:
     """Direct alignment on a GPU or on the CPU.
 
-    If a GPU fails, the CPU repeats the current alignment and computes all later ones. Its results
-    do not depend on the alignments before it.
+    If a GPU fails, the CPU repeats the current alignment and computes all later ones. The results
+    of the CPU do not depend on earlier alignments.
 
     Args:
-        on_gpu: Computation of normal equations on a GPU, which raises DeviceError if the GPU fails;
-            None for the CPU.
-        device: Choice of the device; None if the program chose it.
+        on_gpu: Function that computes normal equations on a GPU and raises DeviceError if the GPU
+            fails; None for the CPU.
+        device: Device of the alignment, with the reason for its choice. None means the CPU.
 
     Attributes:
         device: Device of the alignment, with the reason for its choice.
@@ -96,9 +96,9 @@ class Aligner:
 def choose_aligner(wanted: str) -> Aligner:
     """Choose a device, and return the direct alignment on it.
 
-    A GPU is used if `wanted` is cuda, and if it passes the self-test. With auto, the CPU aligns
-    frames: no GPU has been measured yet, and a choice by a measurement at the start would change
-    the bits of the results from run to run.
+    If `wanted` is cuda, a GPU that passes the self-test aligns frames. If `wanted` is auto, the CPU
+    aligns frames, because no GPU has been measured to be faster. The speed is not measured at each
+    start, because then the choice, and the bits of the results, could change from run to run.
 
     Args:
         wanted: Setting `service.device`.

@@ -67,7 +67,7 @@ class ResidualConfig:
 class BrightnessModel:
     """Brightness change and residual noise of a frame relative to its reference keyframe.
 
-    Alignment estimates all four values together with the pose, starting from the defaults.
+    Alignment starts from the default values and estimates all four values with the pose.
     """
 
     gain: float = 1.0
@@ -86,7 +86,7 @@ class ResidualStatistics:
 
     @property
     def inlier_fraction(self) -> float:
-        """Fraction of the residuals within 3 sigma; 0 if there are none."""
+        """Fraction of the residuals within 3 sigma; 0 if there are no residuals."""
         return self.inliers / self.count if self.count else 0.0
 
 
@@ -194,8 +194,8 @@ class AlignConfig:
         """Return the settings for a camera whose depth bias is uncertain.
 
         Args:
-            relative_sigma: Standard deviation of the bias: 0 without a bias, and 1 for a camera
-                that is not calibrated yet; see `CameraKnowledge`.
+            relative_sigma: Standard deviation of the bias as a fraction of that of an uncalibrated
+                camera: 0 without a bias, 1 without a calibration; see `CameraKnowledge`.
         """
         if not relative_sigma:
             return self
@@ -220,7 +220,7 @@ class AlignConfig:
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Pose of a camera in its reference keyframe, with quality measures."""
+    """Pose of a camera relative to its reference keyframe, with quality measures."""
 
     T_reference_camera: np.ndarray  # [4, 4]
     # [6, 6] for T_reference_camera * exp(xi), xi = (rotation rad, translation m).

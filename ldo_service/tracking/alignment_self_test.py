@@ -38,15 +38,15 @@ Outcome = dict[str, np.ndarray]
 
 
 def run_self_test(arrays: Arrays, repeats: int = REPEATS) -> None:
-    """Compare normal equations and an alignment of a GPU with those of the CPU, and repeat them.
+    """Check that a GPU computes the same normal equations and alignment as the CPU.
 
     Args:
-        arrays: Arrays of the GPU.
-        repeats: Number of repetitions, at least 1.
+        arrays: Access to the arrays of the GPU.
+        repeats: Number of times that the GPU repeats the computation, at least 1.
 
     Raises:
-        DeviceError: The device fails, its results differ from those of the CPU, or they differ
-            between repetitions.
+        DeviceError: The GPU fails, or its results differ from those of the CPU or between
+            repetitions.
     """
     scene = make_scene(WIDTH_PX, HEIGHT_PX)
     wanted, first = outcome(scene, normal_equations), None
@@ -60,9 +60,10 @@ def run_self_test(arrays: Arrays, repeats: int = REPEATS) -> None:
 
 
 def make_scene(width: int, height: int) -> tuple[ReferencePoints, Pyramid]:
-    """Return reference points, and a darker image of their surface that has holes.
+    """Return the reference points of a surface, and a second image of the same surface.
 
-    The surface is a textured slope with a step. The camera of the image has moved slightly.
+    The surface is a textured slope with a step. For the second image, the camera has moved slightly
+    and the gray levels are lower. The depth of both images has holes.
 
     Args:
         width: Width of the image, pixels.
@@ -88,7 +89,7 @@ def make_scene(width: int, height: int) -> tuple[ReferencePoints, Pyramid]:
 
 
 def outcome(scene: tuple[ReferencePoints, Pyramid], linearize: Linearizer) -> Outcome:
-    """Return the results for a scene as arrays by name."""
+    """Return the normal equations and the alignment for a scene, as arrays by name."""
     reference, frame = scene
     points, target = reference.points[0], frame.levels[0]
     T = se3.exp(XI)
@@ -112,13 +113,13 @@ def require_equal(got: Outcome, wanted: Outcome) -> None:
     """Check the results of a GPU.
 
     Raises:
-        DeviceError: They differ from those of the CPU.
+        DeviceError: The results of the GPU differ from those of the CPU.
     """
     for name, difference in differences(got, wanted).items():
         if not difference <= TOLERANCE[name]:  # NaN is above every limit.
             raise DeviceError(
-                f"{name} differs by {difference:.1e} from the CPU, at most {TOLERANCE[name]:.0e} "
-                "is allowed."
+                f"{name} differs by {difference:.1e} from the CPU result; at most "
+                f"{TOLERANCE[name]:.0e} is allowed."
             )
 
 

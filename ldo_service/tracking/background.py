@@ -39,7 +39,7 @@ def with_foreground(
 
     Args:
         tracked: The frame, which becomes a keyframe.
-        view: Its pyramid.
+        view: Image pyramid of the frame.
         database: Records of earlier keyframes.
         config: Settings.
     """

@@ -62,12 +62,12 @@ class FeatureConfig:
         if self.ransac_iterations < 1 or self.min_inliers < 6:
             raise ConfigError(
                 named(self, "ransac_iterations", "min_inliers")
-                + ": ransac_iterations must be at least 1, min_inliers at least 6."
+                + ": ransac_iterations must be at least 1, and min_inliers must be at least 6."
             )
         if not (0 < self.ratio <= 1 and min(self.reprojection_px, self.contrast) > 0):
             raise ConfigError(
                 named(self, "ratio", "reprojection_px", "contrast")
-                + ": ratio must be within 0..1, reprojection_px and contrast positive."
+                + ": ratio must be within 0..1; reprojection_px and contrast must be positive."
             )
 
 
@@ -226,12 +226,12 @@ class GicpConfig:
         if self.level < 0 or self.iterations < 1:
             raise ConfigError(
                 named(self, "level", "iterations")
-                + ": level must not be negative, iterations at least 1."
+                + ": level must be at least 0, and iterations must be at least 1."
             )
         if not (0 < self.spacing < self.reach and 0 < self.min_partners <= 1):
             raise ConfigError(
                 named(self, "spacing", "reach", "min_partners")
-                + ": spacing must be positive and below reach, min_partners within 0..1."
+                + ": spacing must be positive and below reach; min_partners must be within 0..1."
             )
 
 

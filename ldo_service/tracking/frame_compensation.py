@@ -1,4 +1,4 @@
-"""Pyramid of the current frame, with the motion of the camera during the frame compensated.
+"""Image pyramid of the current frame, compensated for the camera motion during the frame.
 
 Conventions: `ldo_service.geometry`.
 """
@@ -29,9 +29,9 @@ WORSE_OVERLAP, WORSE_NOISE = 0.8, 1.5
 
 
 class FrameCompensator:
-    """Maker of the image pyramid of a frame, with the camera motion during the frame compensated.
+    """Builder of image pyramids that are compensated for the camera motion during the frame.
 
-    From one frame to the next, it keeps only a cache of the last frame, which `forget` clears.
+    The object keeps only a cache of the last frame; `forget` clears this cache.
     """
 
     def __init__(self, config: OdometryConfig, guesses: InitialGuessAligner) -> None:
@@ -44,9 +44,10 @@ class FrameCompensator:
         self.motion: FrameMotion | None = None
 
     def expect(self, frame: RgbdFrame, state: OdometryState) -> Pyramid:
-        """Compensate the rolling shutter and the delay of depth before a frame is tracked.
+        """Return the pyramid of a new frame, compensated for the expected camera motion.
 
-        The motion of the camera is predicted from the last frames.
+        The motion of the camera is predicted from the last frames. The compensation covers the
+        rolling shutter and the delay of depth.
         """
         expected = state.shutter.expected_motion(state.motion, frame.stamp_ns, self.config.shutter)
         return self._compensate(frame, expected)
@@ -58,7 +59,7 @@ class FrameCompensator:
         return self._view[1]
 
     def finish(self, frame: RgbdFrame) -> None:
-        """Compensate the last frame again if `measure` has corrected its motion.
+        """Compensate the last frame again if `measure` has corrected the motion of this frame.
 
         Args:
             frame: The frame of the last call of `expect`.
@@ -76,17 +77,21 @@ class FrameCompensator:
     ) -> tuple[PoseHypothesis, ShutterState]:
         """Measure the motion of the camera during a frame, and return the pose for this motion.
 
-        The frame was compensated for the expected motion. If the measured motion differs from it by
-        more than `ShutterConfig.realign_ratio`, the frame is compensated again and aligned again.
-        Up to `max_linear_ratio`, an OK frame that becomes no keyframe is not aligned again: only
-        its pose is corrected, to first order.
+        The frame was compensated for the expected motion. What follows depends on the relative
+        difference between the measured and the expected motion:
+
+        - up to `ShutterConfig.realign_ratio`: the pose stays as it is.
+        - up to `ShutterConfig.max_linear_ratio`, if the frame is OK and is not made a keyframe: the
+          pose is corrected to first order.
+        - otherwise: the frame is compensated and aligned again.
 
         Args:
             frame: The frame of the last call of `expect`.
-            keyframe: The reference of the frame.
-            candidate: The pose of the frame.
-            status: Tracking status of the frame. Only OK frames are evidence for the timing.
-            state: State before the frame.
+            keyframe: Reference keyframe of the frame.
+            candidate: Pose of the frame from tracking.
+            status: Tracking status of the frame. Only OK frames contribute to the estimated timing
+                of rolling shutter and depth.
+            state: State of the odometry before the frame.
 
         Returns:
             The pose, and the next state of the compensation.
@@ -125,7 +130,7 @@ class FrameCompensator:
         return candidate, shutter
 
     def forget(self) -> None:
-        """Drop the last frame."""
+        """Clear the cache of the last frame."""
         self._view = self.motion = self._compensated = None
 
     def _compensate(self, frame: RgbdFrame, motion: FrameMotion | None) -> Pyramid:

@@ -1,9 +1,10 @@
 """Frame-to-keyframe tracking: the pose of a frame against its reference keyframe.
 
-The tracker aligns a frame from the pose that constant velocity predicts. If the tracking status of
-the result is not OK or the image moved far, the tracker also aligns the frame from all other
-initial guesses. The quality of the best result determines the tracking status. A LOST camera is
-relocalized. The module `odometry` decides on keyframes. Conventions: `ldo_service.geometry`.
+The tracker first aligns a frame from the pose that a constant-velocity model predicts. It then
+tries all other initial guesses if the first result is not OK, or if the image has moved far since
+the last frame. The quality of the best result determines the tracking status. If the status is
+LOST, the tracker relocalizes the camera. The module `odometry` decides which frames become
+keyframes. Conventions: `ldo_service.geometry`.
 """
 
 import logging
@@ -60,7 +61,7 @@ class FrameTracker:
 
     @property
     def can_reuse_keyframes(self) -> bool:
-        """True once `keyframe_reuse.after` keyframes have been made; never if that setting is 0."""
+        """True if at least `keyframe_reuse.after` keyframes were made and this setting is not 0."""
         return 0 < self.config.keyframe_reuse.after <= self.state.next_id
 
     def track(self, frame: RgbdFrame, prior: PriorPose | None = None) -> TrackedFrame:
@@ -126,7 +127,7 @@ class FrameTracker:
         )
 
     def restart_at(self, frame: RgbdFrame, T_odom_camera: np.ndarray) -> None:
-        """Reset tracking and start a submap with the frame just tracked at T_odom_camera [4, 4]."""
+        """Reset tracking to T_odom_camera [4, 4], the pose of the last frame; start a submap."""
         self.state = replace(
             self.state,
             motion=ConstantVelocity(T_odom_camera, stamp_ns=frame.stamp_ns),
@@ -162,7 +163,7 @@ class FrameTracker:
         return self._compensator.motion
 
     def use_knowledge(self, camera: CameraKnowledge) -> None:
-        """Use the shutter timing, and how uncertain the depth bias is, for the next frames."""
+        """Apply new estimates of shutter timing and depth-bias uncertainty to the next frames."""
         align = self.config.align.with_bias(camera.relative_bias_sigma)
         self._compensator.guesses = self._guesses = replace(self._guesses, align=align)
         self.state = self.state.informed(camera, self.config.pyramid, self.config.shutter)

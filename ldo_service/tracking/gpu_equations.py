@@ -41,12 +41,13 @@ NO_POINTS = np.zeros((7, 0), np.float32)
 class GpuEquations:
     """Normal equations by the kernels of `kernels.gpu`.
 
-    Points, texels and cells stay on the device as long as the host has them. A call uploads those
-    that are not there yet, and 100 bytes. It downloads 51 numbers, with cells 896 numbers more.
+    The points, texels and cells of a call stay on the device as long as their arrays exist on the
+    host. A call uploads only the arrays that the device lacks, and 100 bytes of parameters. It
+    downloads 51 sums. If `cells` is given, it also downloads 896 gradient values.
 
     The results are bitwise equal on one GPU model and one version of Triton. They differ from those
-    of the CPU in the last bits. A residual adds nothing if its point, gray level or normal is not
-    finite.
+    of the CPU in the last bits. Residuals whose point, gray level or normal is not finite are
+    excluded from the sums.
 
     Args:
         arrays: Arrays of the device.
@@ -71,7 +72,7 @@ class GpuEquations:
     ) -> NormalEquations:
         """Linearize the residuals of reference points; see `alignment.normal_equations`.
 
-        The arrays must not change while they exist.
+        Do not change the contents of passed arrays later: the device would use an outdated copy.
 
         Raises:
             ValueError: An array has a wrong shape, or the transform is not rigid.
@@ -82,7 +83,7 @@ class GpuEquations:
         if points.ndim != 2 or len(points) != 7 or points.dtype != np.float32:
             raise ValueError(f"points must be [7, N] float32, not {points.shape} {points.dtype}.")
         if cells is not None and (len(cells) != points.shape[1] or (cells >= CELLS).any()):
-            raise ValueError("cells must have a number below 64 for each point.")
+            raise ValueError("cells must have one cell number per point, each below 64.")
         problem = problem_of(
             T_camera_reference,
             target.intrinsics,
@@ -102,7 +103,10 @@ class GpuEquations:
             )
         if not (np.isfinite(sums).all() and np.isfinite(by_cell).all()):
             # The CPU repeats the alignment. The next pose would not be rigid, and the frame lost.
-            raise DeviceError("the sums of the alignment have NaN or infinity.")
+            raise DeviceError(
+                "the GPU computed NaN or infinity in the alignment. If this happens again, set "
+                "service.device=cpu."
+            )
         return _equations(sums, by_cell)
 
     def _on_device(

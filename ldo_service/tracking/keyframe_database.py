@@ -60,10 +60,12 @@ class KeyframeDatabaseConfig:
         if self.count < 3 or self.features < 1:
             raise ConfigError(
                 named(self, "count", "features")
-                + ": count must be at least 3, features at least 1."
+                + ": `count` must be at least 3, and `features` at least 1."
             )
         if self.same < 0 or self.recent < 0:
-            raise ConfigError(named(self, "same", "recent") + " must not be negative.")
+            raise ConfigError(
+                named(self, "same", "recent") + ": `same` and `recent` must not be negative."
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,13 +92,13 @@ class KeyframeRecord:
 
     @cached_property
     def features(self) -> Features:
-        """ORB features with their pixels in `camera`."""
+        """ORB features of the keyframe; their pixels are those of an image of `camera`."""
         points, change = self.points_camera.astype(np.float64), self.change
         points = points if change is None else change.points(points, self.camera)
         return Features(self.camera.project(points), points, self.descriptors)
 
     def sift_features(self, config: FeatureConfig) -> Features:
-        """Return the SIFT features of the gray image, at most `count_across_scales` / 2.
+        """Return at most `config.count_across_scales` / 2 SIFT features of the gray image.
 
         The features are detected on the first call and cached.
         """
@@ -160,7 +162,7 @@ class KeyframeRecord:
         """Return a copy of the record without the features, intensity and depth of masked pixels.
 
         Args:
-            ignore_mask: Mask, [H, W] bool, of the size of `camera`.
+            ignore_mask: Pixels to remove, [H, W] bool at the resolution of `camera`.
         """
         if not ignore_mask.any():
             return self
@@ -298,7 +300,7 @@ class KeyframeDatabase:
         return KeyframeDatabase((*(other for other in self.all if other.id != record.id), record))
 
     def without(self, ignore_mask: np.ndarray, keyframe: int) -> "KeyframeDatabase":
-        """Return the database with `KeyframeRecord.without` applied to the record `keyframe`."""
+        """Return the database with masked pixels removed from the record with the id `keyframe`."""
         records = (p.without(ignore_mask) if p.id == keyframe else p for p in self.all)
         return KeyframeDatabase(tuple(records))
 
@@ -328,7 +330,7 @@ class KeyframeDatabase:
         return (*self.all[:nearest], *self.all[nearest + 1 :])
 
     def rank_by_similarity(self, view: Pyramid) -> list[int]:
-        """Return the indices of all records by descending correlation of their thumbnails."""
+        """Return the indices of all records; the thumbnail most similar to the frame is first."""
         correlations = self._thumbnails @ make_thumbnail(view).astype(np.float32)
         return np.argsort(-correlations, kind="stable").tolist()
 

@@ -1,13 +1,15 @@
 """Keyframe reuse. Conventions: `ldo_service.geometry`.
 
-A robot that repeats its route would make similar keyframes on every run, and the
-map would grow without limit. This is avoided once the map has many keyframes. Before a new keyframe
-is made, the tracker searches for a known keyframe that shows the same surface. The known keyframe
-is reused only if the map and the images agree on the pose of the camera. If they disagree, odometry
-has drifted. New keyframes are then made, so that a loop closure can correct the map.
+A robot that repeats its route would make similar keyframes on every run, and the map would grow
+without limit. Keyframe reuse prevents this growth; it starts once the map has many keyframes.
+Before a new keyframe is made, the tracker searches for a known keyframe that shows the same
+surface. The known keyframe is reused only if the map and the images agree on the pose of the
+camera. If they disagree, odometry has drifted. The tracker then makes new keyframes, so that a loop
+closure can correct the map.
 
 A camera may come from newly mapped surface back to a known keyframe. The tracker then makes one
-more keyframe, measured relative to the known one, to connect both in the pose graph.
+more keyframe and measures its pose relative to the known keyframe. This measurement connects the
+new and the known keyframes in the pose graph.
 """
 
 from collections.abc import Mapping, Sequence
@@ -55,12 +57,13 @@ class KeyframeReuseConfig:
     def __post_init__(self) -> None:
         if self.after < 0 or self.tries < 1:
             raise ConfigError(
-                named(self, "after", "tries") + ": after must be at least 0, tries at least 1."
+                named(self, "after", "tries")
+                + ": `after` must be at least 0, and `tries` at least 1."
             )
         if not (self.agreement_rad > 0 and 0 <= self.min_geometric_inliers <= 1):
             raise ConfigError(
                 named(self, "agreement_rad", "min_geometric_inliers")
-                + ": agreement_rad must be positive, min_geometric_inliers within 0..1."
+                + ": agreement_rad must be positive, and min_geometric_inliers within 0..1."
             )
 
 
@@ -73,14 +76,18 @@ class ReusedKeyframe:
     candidate: PoseHypothesis  # Alignment of the frame to the keyframe.
 
     def measurement_of(self, keyframe: int) -> RelativePose:
-        """Return the pose of the aligned frame, which becomes `keyframe`, relative to `record`."""
+        """Return the measured pose of a new keyframe relative to the reused keyframe.
+
+        Args:
+            keyframe: Id of the new keyframe, which is made of the aligned frame.
+        """
         seen = self.candidate.alignment
         return RelativePose(self.record.id, keyframe, seen.T_reference_camera, seen.information)
 
 
 @dataclass(frozen=True, slots=True)
 class KeyframeReuse:
-    """Search for a known keyframe that can be the reference instead of a new one."""
+    """Search for a known keyframe that can be the reference instead of a new keyframe."""
 
     pyramid: PyramidConfig
     align: AlignConfig
@@ -96,7 +103,8 @@ class KeyframeReuse:
 
         Args:
             view: Pyramid of the frame.
-            near: Records with T_keyframe_camera as the map predicts it, the nearest first.
+            near: Each record with the T_keyframe_camera [4, 4] that the map predicts, the nearest
+                record first.
             history: Residual noise of the last frames, which limits the noise of the alignment.
 
         Returns:

@@ -35,8 +35,8 @@ class KeyframeConfig:
     # Maximum number of frames between reference keyframes while the camera moves.
     max_frames: int = 30
     # A relay is a reference that is used for tracking but not mapped. While the caller allows no
-    # keyframe, as at held-out frames, a frame becomes a relay if its motion exceeds the limits
-    # above times this ratio, or if its overlap is below min_overlap divided by it. A ratio of 1
+    # keyframe, as at held-out frames, a frame becomes a relay if its motion exceeds this ratio
+    # times the limits above, or if its overlap is below min_overlap / relay_ratio. A ratio of 1
     # would make a relay of each such frame that needs a keyframe, and each relay adds a link to the
     # chain of relative poses.
     relay_ratio: float = 1.5
@@ -56,7 +56,7 @@ class KeyframeConfig:
         if not (0 <= self.still_overlap <= 1 and self.still_motion >= 0):
             raise ConfigError(
                 f"KeyframeConfig.still_overlap={self.still_overlap:g} must be within 0..1, "
-                f"still_motion={self.still_motion:g} at least 0."
+                f"and still_motion={self.still_motion:g} must be at least 0."
             )
         if not min(self.max_rotation_rad, self.max_translation, self.mapping_only_ratio) > 0:
             raise ConfigError(
@@ -162,10 +162,14 @@ class ReferenceKeyframe:
     def with_moved(
         self, moved_mask: np.ndarray, config: MotionSegmentationConfig
     ) -> "ReferenceKeyframe":
-        """Return the keyframe without the surface that has moved, `moved_mask` [H, W] bool.
+        """Return the keyframe with a new mask of moved surface, which is ignored from now on.
 
-        Pixels that are ignored already stay ignored, such as people who stood still in the
-        keyframe.
+        Pixels that the keyframe ignored before stay ignored, such as those of people who stood
+        still in the keyframe.
+
+        Args:
+            moved_mask: Pixels whose surface has moved, [H, W] bool at the finest pyramid level.
+            config: Settings.
         """
         ignore_mask = grow_mask(moved_mask, self.view, config)
         if self.ignore_mask is not None:
@@ -173,7 +177,7 @@ class ReferenceKeyframe:
         return replace(self, moved_mask=moved_mask, ignore_mask=ignore_mask)
 
     def recorrected(self, change: CorrectionChange, config: PyramidConfig) -> "ReferenceKeyframe":
-        """Return the keyframe with images and features converted to a new camera correction."""
+        """Return the keyframe converted to a new correction of vignetting and depth bias."""
         view, camera = self.view, self.view.camera
         gray, depth_m = change.gray(view.gray, camera), change.depth_m(view.depth_m, camera)
         features = self.stored_features
@@ -188,11 +192,12 @@ class ReferenceKeyframe:
     def retimed(
         self, timing: ShutterTiming, velocity: np.ndarray, config: PyramidConfig
     ) -> "ReferenceKeyframe":
-        """Return the keyframe after compensation of its motion with another timing of the shutter.
+        """Return the keyframe, compensated for camera motion with a new shutter timing.
 
         Args:
             timing: The new timing.
-            velocity: Velocity of the camera, [6], if `motion` is unknown.
+            velocity: Velocity of the camera, [6]: rotation in rad/s, then translation in m/s. It is
+                used only if `self.motion` is None.
             config: Settings of the pyramid.
         """
         before = self.motion or FrameMotion(velocity, ShutterTiming())

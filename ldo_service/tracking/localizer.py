@@ -47,13 +47,13 @@ class MapFix:
     def is_search_due(self, config: SubmapConfig) -> bool:
         """Return whether to relocalize the current frame in the map.
 
-        Every frame is relocalized until the camera is found, then one in
-        `config.search_interval_frames`.
+        Every frame is relocalized until the camera is found in the map. After that, a frame is
+        relocalized when `config.search_interval_frames` frames have passed since the last search.
         """
         return self.T_map_odom is None or self.frames_since_search >= config.search_interval_frames
 
     def after(self, tracked: TrackedFrame) -> "MapFix":
-        """Return the pose of odometry in the map after one more frame.
+        """Return the state after one more tracked frame.
 
         If odometry has started a new submap, T_map_odom is unknown again.
         """
@@ -62,9 +62,9 @@ class MapFix:
         return replace(self, frames_since_search=self.frames_since_search + 1)
 
     def with_search_result(self, match: SubmapMatch, config: SubmapConfig) -> "MapFix":
-        """Return the pose of odometry in the map after a relocalization match.
+        """Return the state after a relocalization match.
 
-        T_map_odom changes only if the previous match agrees with the new one.
+        T_map_odom changes only if the previous match agrees with the new match.
         """
         is_confirmed = self.pending_match is not None and self.pending_match.is_consistent_with(
             match, config
@@ -75,12 +75,12 @@ class MapFix:
         return replace(self, T_map_odom=T_map_odom, pending_match=match, frames_since_search=since)
 
     def pack(self) -> dict[str, Any]:
-        """Return the fix as arrays and plain values."""
+        """Return the state as arrays and plain values."""
         return asdict(self)
 
     @staticmethod
     def unpack(kept: dict[str, Any]) -> "MapFix":
-        """Return the fix from its packed form."""
+        """Return the state from its packed form."""
         match = kept["pending_match"]
         return MapFix(**{**kept, "pending_match": match and SubmapMatch(**match)})
 
@@ -123,8 +123,8 @@ class Localizer(Odometry):
             frame: The frame.
             prior: The last poses of another odometry, such as wheels.
             may_map: Unused, since nothing is mapped.
-            camera: Estimates of the camera that the self-calibration has made so far; None if it
-                is off.
+            camera: Shutter timing and depth-bias uncertainty that the self-calibration has
+                estimated so far; None if the self-calibration is off.
 
         Returns:
             The pose of the frame in odometry and in the map. The status is LOST until the camera is

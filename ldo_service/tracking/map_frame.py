@@ -93,8 +93,8 @@ class MapFrame:
         Args:
             keyframe: Id of the new keyframe.
             tracked: The frame.
-            next_reference: Id of the keyframe that the next frame is aligned to, or None. Its pose
-                stays stored even if it is not recent.
+            next_reference: Id of the keyframe that the next frame is aligned to, or None. The pose
+                of this keyframe stays stored even if the keyframe is not recent.
         """
         self._poses.add(
             keyframe,

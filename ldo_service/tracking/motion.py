@@ -20,10 +20,11 @@ class ConstantVelocity:
     stamp_ns: int = 0  # Stamp of the last pose.
 
     def predicted(self, stamp_ns: int) -> np.ndarray:
-        """Return T_odom_camera [4, 4] at a stamp: T * exp(twist * elapsed / interval).
+        """Return T_odom_camera [4, 4] at a stamp, extrapolated with constant velocity.
 
-        The elapsed time is limited to MAX_STEPS intervals. It counts as one interval if the stamp
-        is not later than the last one, or if the interval is unknown.
+        The result is T_odom_camera * exp(twist * elapsed / interval). Here `elapsed` is the time
+        from the last pose to the stamp, but at most MAX_STEPS intervals. One interval is used if
+        the stamp is not later than the last pose, or if the interval is unknown.
         """
         elapsed_ns = stamp_ns - self.stamp_ns
         timed = elapsed_ns > 0 and self.interval_ns > 0

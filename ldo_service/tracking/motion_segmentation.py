@@ -81,7 +81,7 @@ class MotionSegmentationConfig:
                     "gone_frames",
                     "renewed_share",
                 )
-                + ": none may be negative, and gone_frames must be within 1..255."
+                + ": no value may be negative, and gone_frames must be within 1..255."
             )
 
 
@@ -95,7 +95,7 @@ class MotionEvidence:
     gone: np.ndarray | None
 
     def fits(self, now: Level, then: Level) -> bool:
-        """Return whether the masks have the sizes of the frame (now) and the keyframe (then)."""
+        """Return whether the masks match the sizes of the frame `now` and the keyframe `then`."""
         is_of_keyframe = self.gone is None or self.gone.shape == then.depth_m.shape
         return is_of_keyframe and self.contradicts.shape == now.depth_m.shape
 
@@ -115,11 +115,11 @@ class MotionMasks:
     evidence: MotionEvidence  # State for the next frame.
 
     def has_large_change(self, known: np.ndarray | None, config: MotionSegmentationConfig) -> bool:
-        """Return whether `moved_mask` has many pixels that a known mask lacks.
+        """Return whether many pixels of `moved_mask` are not in a known mask.
 
         Args:
             known: Mask of pixels already known as moved, [H, W] bool; None if there is none.
-            config: Settings; `renewed_share` is the limit.
+            config: Settings; `renewed_share` is the limit as a fraction of all pixels.
         """
         news = self.moved_mask if known is None else self.moved_mask & ~known
         return bool(np.mean(news) > config.renewed_share)
@@ -227,7 +227,7 @@ def foreground_mask(
     noise: DepthNoise,
     dynamic_mask: np.ndarray,
 ) -> np.ndarray | None:
-    """Return the pixels of a frame in front of the surface that a keyframe measured.
+    """Return the pixels of a frame that lie in front of the surface measured by a keyframe.
 
     Args:
         view: Pyramid of the frame.

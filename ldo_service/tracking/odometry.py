@@ -60,7 +60,7 @@ class Odometry:
     Equal frames, priors and corrections give bitwise equal results.
 
     Attributes:
-        aligner: Direct alignment, with the device on which it runs.
+        aligner: Direct alignment on a GPU or on the CPU.
     """
 
     def __init__(
@@ -102,8 +102,8 @@ class Odometry:
                 images: a frame is OK only if its images confirm the pose.
             may_map: True allows a new keyframe or submap. If it is False and a keyframe is needed,
                 `TrackingResult.denied_keyframe` names the kind of keyframe.
-            camera: Estimates of the camera that the self-calibration has made so far; None if it
-                is off.
+            camera: Shutter timing and depth-bias uncertainty that the self-calibration has
+                estimated so far; None if the self-calibration is off.
 
         Returns:
             The pose of the frame, and the keyframe that was made of it, if any.
@@ -164,7 +164,7 @@ class Odometry:
         return self._map.correct(correction)
 
     def recorrect(self, change: CorrectionChange) -> None:
-        """Replace the camera correction of all keyframe images; their poses stay the same."""
+        """Replace the vignetting and depth-bias correction of all keyframe images, but no pose."""
         state = self._frames.state
         self._frames.restore(state.recorrected(change, self.config.pyramid))
 

@@ -212,12 +212,12 @@ class DeadReckoningStart:
     reading: PriorPose  # Pose of the same frame in the prior.
 
     def dead_reckon(self, now: PriorPose, config: PriorConfig) -> np.ndarray | None:
-        """Return T_odom_camera [4, 4] at a later time, by the motion of the prior since then.
+        """Return T_odom_camera [4, 4] at `now`: the start pose, moved as the prior has moved since.
 
-        T_odom_now = T_odom_then * inverse(T_prior_then) * T_prior_now
+        T_odom_now = T_odom_start * inverse(T_prior_start) * T_prior_now
 
-        Return None if the prior has begun another session since, or if more than
-        `config.max_dead_reckoning_s` have passed.
+        Return None if the prior has begun another session since the start, or if more than
+        `config.max_dead_reckoning_s` seconds have passed.
         """
         then, elapsed_s = self.reading, (now.stamp_ns - self.reading.stamp_ns) * 1e-9
         if now.session != then.session or not 0 <= elapsed_s <= config.max_dead_reckoning_s:

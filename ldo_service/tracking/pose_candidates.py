@@ -39,7 +39,7 @@ class PoseHypothesisConfig:
         if not (self.agreement_rad > 0 and 0 < self.min_support_ratio <= 1):
             raise ConfigError(
                 f"PoseHypothesisConfig.agreement_rad={self.agreement_rad:g} must be positive, "
-                f"min_support_ratio={self.min_support_ratio:g} within 0..1."
+                f"and min_support_ratio={self.min_support_ratio:g} above 0 and at most 1."
             )
 
 
@@ -104,8 +104,9 @@ def support(
     The inliers are counted among the reference points of the keyframe.
 
     Alignment has estimated the noise of each hypothesis separately, and a wrong pose inflates the
-    noise. All hypotheses are therefore evaluated with the smallest of these noise estimates. Points
-    that are paired with a measured depth have the weight 1, all visible points a weight of 0.05.
+    noise. All hypotheses are therefore evaluated with the smallest of these noise estimates. Each
+    visible point has the weight 0.05. A point that is paired with a measured depth also has the
+    weight 1, so its total weight is 1.05.
 
     Args:
         candidate: The hypothesis.

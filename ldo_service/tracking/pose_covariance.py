@@ -1,24 +1,27 @@
 """Covariance of the pose that alignment estimates.
 
-The residuals of neighboring points have correlated errors: a reflection, a blurred edge or a bias
-of the depth shifts many of them alike. The inverse Hessian H^-1 of the normal equations takes the
-residuals as independent, so it is too small by a factor that depends on the sensor. The covariance
-is therefore computed as
+The residuals of neighboring points have correlated errors. For example, a reflection, a blurred
+edge or a depth bias changes many residuals alike. The inverse Hessian H^-1 of the normal equations
+is a covariance for independent residuals. It is therefore too small, by a factor that depends on
+the sensor. This module computes the covariance as
 
-    scale (H^-1 S H^-1 + max(tr(H^-1 S) / 6, 1) H^-1) + floor,
+    scale (H^-1 S H^-1 + max(tr(H^-1 S) / 6, 1) H^-1) + floor.
 
-where S is the sum of g g^T, and g is the gradient of the color or of the depth residuals of one
-cell of the image at the pose. `CovarianceConfig` sets the factor `scale` and the standard
-deviations of the diagonal matrix `floor`. The first term is the sandwich estimator (Liang and
-Zeger, "Longitudinal data analysis using generalized linear models", 1986). It grows where cells, or
-color and depth, contradict each other. The second term has the shape of H^-1 and the mean size of
-the first one. It covers directions in which the few gradients are small by coincidence. Its factor
-is at least 1, the value for independent residuals. `PRIOR` makes H regular.
+The image is divided into cells. Each cell has two gradients g of its residuals at the pose: one for
+color and one for depth. S is the sum of g g^T over all these gradients. `CovarianceConfig` sets the
+factor `scale` and the standard deviations of the diagonal matrix `floor`. `PRIOR` makes H regular.
 
-Errors that all cells have in common do not show in the spread of the cells. An example is a depth
-bias that looks like a rotation. Color and depth then favor different poses, so `contradiction`
-compares the poses that color alone and depth alone would yield. The covariance grows along the
-directions in which they contradict each other. Conventions: `ldo_service.geometry`.
+The first term is the sandwich estimator (Liang and Zeger, "Longitudinal data analysis using
+generalized linear models", 1986). It grows where cells, or color and depth, contradict each other.
+The second term has the shape of H^-1 and the mean size of the first term. It covers directions in
+which the few gradients are small by coincidence. Its factor is at least 1, the value for
+independent residuals.
+
+The spread of the gradients does not reveal an error that is common to all cells, such as a depth
+bias that looks like a rotation. Color and depth then favor different poses. The function
+`contradiction` therefore compares the pose from color alone with the pose from depth alone. The
+covariance grows along the directions in which these poses contradict each other.
+Conventions: `ldo_service.geometry`.
 """
 
 from dataclasses import dataclass
@@ -45,10 +48,10 @@ MIN_CONDITION = 1e-15  # Fraction of the largest eigenvalue; double precision re
 class CovarianceConfig:
     """Settings of the covariance of a pose.
 
-    They were chosen on seven sequences with exact ground truth. The measure is the mean normalized
-    estimation error squared, whose expected value is 6. It is 1.7 to 5.0 on five sequences with few
-    or no errors of a camera. On the two sequences with all simulated errors of a camera, it is 7.4
-    and 11.1. See docs/benchmarks/covariance.md.
+    The defaults were chosen on seven sequences with exact ground truth, by the mean normalized
+    estimation error squared (NEES). Its expected value is 6. The NEES was 1.7 to 5.0 on the five
+    sequences whose camera has few errors or none. It was 7.4 and 11.1 on the two sequences that
+    simulate all camera errors. See docs/benchmarks/covariance.md.
     """
 
     scale: float = 5.0  # Factor on the covariance, before the floor is added.
@@ -83,8 +86,8 @@ def pose_covariance(
 
     Args:
         hessian: Hessian of pose, gain and bias at the pose, [8, 8].
-        gradients: Gradients of the groups of residuals whose errors are taken as independent of
-            each other, [N, 8].
+        gradients: Gradients of N groups of residuals, [N, 8]. The errors of different groups are
+            taken as independent.
         config: Settings.
     """
     brightness = hessian[BRIGHTNESS, BRIGHTNESS] + np.diag(BRIGHTNESS_PRIOR)
@@ -104,21 +107,22 @@ def contradiction(
     depth_hessian: np.ndarray,
     depth_gradient: np.ndarray,
 ) -> np.ndarray:
-    """Return the difference of the poses by color and by depth where they contradict each other.
+    """Return the difference between the poses from color and from depth that noise cannot explain.
 
-    The directions v of the pose are those in which color and depth are independent of each other:
-    H_color v = share (H_color + H_depth) v. A cue with a small share has a large variance along v,
-    so that it cannot contradict the other one there.
+    The difference is tested along each direction v with H_color v = share (H_color + H_depth) v.
+    Here color has the fraction `share` of the information along v, and depth has the rest. If one
+    of them has a small fraction, its pose has a large variance along v. It then cannot contradict
+    the pose from the other.
 
     Args:
         color_hessian: Hessian of the color residuals for pose, gain and bias, [8, 8].
-        color_gradient: Their gradient at the pose, [8].
+        color_gradient: Gradient of the color residuals at the pose, [8].
         depth_hessian: Hessian of the depth residuals for the pose, [6, 6].
-        depth_gradient: Their gradient at the pose, [6].
+        depth_gradient: Gradient of the depth residuals at the pose, [6].
 
     Returns:
-        The increment xi [6] from the pose by depth to the pose by color, to first order, along the
-        directions of contradiction; 0 if there are none.
+        The increment xi [6] from the pose by depth to the pose by color, to first order. It has
+        only the directions along which they contradict each other; 0 if there are none.
     """
     brightness = color_hessian[BRIGHTNESS, BRIGHTNESS] + np.diag(BRIGHTNESS_PRIOR)
     by_brightness = np.linalg.solve(brightness, color_hessian[BRIGHTNESS, POSE])

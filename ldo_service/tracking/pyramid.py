@@ -52,7 +52,8 @@ class PyramidConfig:
             raise ConfigError(f"PyramidConfig.max_depth_m={self.max_depth_m:g} must be positive.")
         if not 0 < self.depth_tolerance < 1:
             raise ConfigError(
-                f"PyramidConfig.depth_tolerance={self.depth_tolerance:g} must be within 0..1."
+                f"PyramidConfig.depth_tolerance={self.depth_tolerance:g} must be above 0 and below "
+                "1."
             )
 
 
@@ -164,7 +165,7 @@ def pyramid_of(
     Args:
         frame: The frame.
         config: Settings.
-        motion: Motion during the frame that is compensated; None without compensation.
+        motion: Motion of the camera during the frame, to be compensated; None for no compensation.
     """
     gray, depth_m = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), frame.depth_m
     if motion is not None and motion.timing:

@@ -91,12 +91,12 @@ class RelocalizationConfig:
         ):
             raise ConfigError(
                 named(self, "appearance_candidates", "in_turn")
-                + " must not be negative, and not both 0."
+                + ": neither value may be negative, and at least one must be positive."
             )
         if self.attempts < 1 or self.across_scales < 0:
             raise ConfigError(
                 named(self, "attempts", "across_scales")
-                + ": attempts must be at least 1, across_scales at least 0."
+                + ": attempts must be at least 1, and across_scales at least 0."
             )
         if not min(self.agreement_rad, self.variety_rad, self.ambiguous_rad) > 0:
             raise ConfigError(
@@ -105,7 +105,7 @@ class RelocalizationConfig:
         if not (0 <= self.min_geometric_inliers <= 1 and 0 <= self.ambiguous_inlier_ratio <= 1):
             raise ConfigError(
                 named(self, "min_geometric_inliers", "ambiguous_inlier_ratio")
-                + " must be within 0..1."
+                + ": both values must be within 0..1."
             )
         if not 0 <= self.familiar <= 1:
             raise ConfigError(
@@ -141,7 +141,7 @@ class Relocalizer:
             database: Keyframe database to search.
             turn: Number of searches before this one. It selects the records that are tried besides
                 the most similar and the newest ones.
-            history: Residual noise of the last frames, for records that store none.
+            history: Residual noise of the last frames. It is used for records without stored noise.
             is_lost: True allows the search by SIFT, which is too slow while tracking works.
 
         Returns:

@@ -1,7 +1,8 @@
-"""Motion of the camera while it records a frame, and its compensation during tracking.
+"""Motion of the camera while it records a frame, and compensation of this motion.
 
-The velocity comes from the poses of the last frames. Before a frame is tracked, it is compensated
-with the expected velocity. If its pose then shows another velocity, it is compensated again.
+The velocity comes from the poses of the last frames. Before a frame is tracked, the frame is
+compensated with the expected velocity. If the tracked pose then shows another velocity, the frame
+is compensated again.
 Conventions: `ldo_service.geometry`.
 """
 
@@ -59,13 +60,15 @@ class ShutterConfig:
 
     def __post_init__(self) -> None:
         if min(self.update_frames, self.max_frames) < 1:
-            raise ConfigError(named(self, "update_frames", "max_frames") + " must be at least 1.")
+            raise ConfigError(
+                named(self, "update_frames", "max_frames") + ": both values must be at least 1."
+            )
         positive = "max_interval_s", "sigmas", "max_s", "max_sigma_s", "realign_ratio"
         if not min(getattr(self, name) for name in positive) > 0:
             raise ConfigError(named(self, *positive) + " must be positive.")
         least = "min_s", "relinearized_s", "min_motion_rad", "max_linear_ratio"
         if not min(getattr(self, name) for name in least) >= 0:
-            raise ConfigError(named(self, *least) + " must be at least 0.")
+            raise ConfigError(named(self, *least) + ": no value may be negative.")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -88,9 +91,9 @@ class ShutterState:
     pending: BandEquations | None = None
 
     def informed(self, equations: np.ndarray | None, config: ShutterConfig) -> "ShutterState":
-        """Return the state with the self-calibration's estimate as the prior of the times.
+        """Return the state with the self-calibration's estimate as the prior of the shutter timing.
 
-        The times are the readout of color, the readout of depth and the delay of depth.
+        The timing has three times: readout of color, readout of depth and delay of depth.
 
         Args:
             equations: Normal equations of the three times in seconds, [3, 4]; see
@@ -119,9 +122,9 @@ class ShutterState:
     ) -> FrameMotion | None:
         """Return the motion during a frame with a known pose; None if unknown.
 
-        The motion is the mean velocity since the last frame. An extrapolation to the frame would
-        amplify the noise of the poses. The noise would affect the compensation more than it affects
-        the equations for the timing, and the estimated times would grow without bound.
+        The motion is the mean velocity since the last frame. A velocity extrapolated to the time of
+        this frame would contain more noise from the poses. This noise would make the estimated
+        times of the shutter grow without bound.
 
         Args:
             before: Pose and time of the last frame that has a pose.
@@ -137,8 +140,9 @@ class ShutterState:
     def moved(self, motion: FrameMotion, config: ShutterConfig) -> "ShutterState":
         """Return the state after a frame with a known motion.
 
-        The motion also shows the velocity at the frame before. This velocity is needed before the
-        residuals of that frame (`pending`) can become evidence for the times of the shutter.
+        The motion also determines the velocity of the camera at the previous frame. With this
+        velocity, the stored residuals of the previous frame (`pending`) contribute to the estimate
+        of the shutter timing.
         """
         mean, earlier, state = motion.velocity, self.mean_velocity, self
         if earlier is not None:
@@ -179,9 +183,9 @@ class ShutterState:
         return replace(self, evidence=evidence, timing=timing)
 
     def metrics(self) -> dict[str, float]:
-        """Return the times in use and the last estimate with its standard deviation, milliseconds.
+        """Return the shutter times in use, and the last estimates with standard deviations (ms).
 
-        The estimate is missing until there is enough evidence for one.
+        The estimates and standard deviations are missing until there is enough evidence.
         """
         found = self.evidence.estimate()
         if found is None:
@@ -228,7 +232,7 @@ def displacement_ratio(
 
     Args:
         expected: Motion that the frame was compensated with; None without compensation.
-        measured: Motion by the pose of the frame.
+        measured: Motion that follows from the tracked pose of the frame.
         median_depth_m: Median depth of the scene.
         camera: Camera of the frame.
 

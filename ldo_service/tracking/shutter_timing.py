@@ -2,12 +2,15 @@
 
 A rolling shutter and a delay between color and depth displace the parts of a frame in proportion to
 the velocity of the camera. The displacement of a row is a twist: the velocity times the time at
-which the row was recorded. The times are thus three more unknowns of the normal equations of
-alignment, and common to all frames. `BandEquations` holds the normal equations of one frame, one
-set for each band of rows. `BandEquations.timing_equations` eliminates pose and exposure, so that
-only the times remain unknown. `TimingEvidence` adds up these equations of many frames. The velocity
-changes its direction over time, so the static errors of a camera, such as a depth bias, average
-out.
+which the row was recorded. This time depends on three constants of the camera: the readout time of
+color, the readout time of depth, and the delay of depth. The three times are thus more unknowns of
+the normal equations of alignment, and are the same for all frames.
+
+`BandEquations` holds the normal equations of one frame, one set for each band of rows.
+`BandEquations.timing_equations` eliminates pose and exposure, so that only the three times remain
+unknown. `TimingEvidence` adds up these equations over many frames. The velocity changes its
+direction over time, so the static errors of a camera, such as a depth bias, average out.
+
 Conventions: `ldo_service.geometry`.
 """
 
@@ -49,8 +52,8 @@ MIN_GROUPS, MAX_GROUPS = 12, 24  # Groups of the jackknife; two are merged beyon
 class BandEquations:
     """Normal equations of a frame at its pose, for each of B bands of rows.
 
-    The unknowns are those of `NormalEquations`: pose increment, gain and bias. Velocities are those
-    of `FrameMotion`: rotation in rad/s, then translation in m/s.
+    The unknowns are those of `NormalEquations`: pose increment, gain and bias. As in `FrameMotion`,
+    each velocity [6] has the rotation in rad/s first, then the translation in m/s.
     """
 
     hessian: np.ndarray  # [B, 2, 8, 8]: color, then depth.
@@ -104,8 +107,9 @@ class BandEquations:
             velocity: Best estimate of the velocity at the frame, [6].
 
         Returns:
-            Information and right side, [3, 4], of the times in the order of `ShutterTiming`. Their
-            solution is the times themselves, not a change of the times already compensated.
+            Information matrix and right side, [3, 4], of the three times in seconds. The order of
+            the times is that of `ShutterTiming`. The solution is the full times, even if the frame
+            was compensated with earlier estimates.
         """
         # Velocities of the reference in the camera frame. All twists change T_reference_camera.
         to_camera = se3.adjoint(self.T_camera_reference)
@@ -138,7 +142,7 @@ def band_equations(
     at_frame: FrameMotion,
     reference_velocity: np.ndarray,
 ) -> BandEquations:
-    """Linearize the residuals of a frame at its pose, by band of rows.
+    """Linearize the residuals of a frame at its pose, separately for each band of rows.
 
     Args:
         reference: Surface points of the reference keyframe.
@@ -188,7 +192,7 @@ def band_equations(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TimingEvidence:
-    """Sums of the timing equations of many frames, in groups of equally many successive frames."""
+    """Timing equations of many frames, summed over groups of successive frames."""
 
     groups: tuple[np.ndarray, ...] = ()  # [3, 4] each: information | right side, in order of time.
     size: int = 1  # Frames per complete group.
@@ -216,11 +220,11 @@ class TimingEvidence:
 
         The times are the readout times of color and depth, and the delay of depth.
 
-        The prior determines those times that the frames do not. The variances are the sum of two
-        estimates. One is a jackknife over the groups of successive frames, which allows for the
-        similar errors of neighboring frames. The other follows from the information of the
-        equations, because a jackknife over few groups may be small by chance. With fewer than
-        `MIN_GROUPS` groups, the result is that of the prior alone, or None if no estimate has
+        If the frames do not determine a time, the prior determines it. Each variance is the sum of
+        two estimates. The first is a jackknife over the groups of successive frames, because
+        neighboring frames have similar errors. The second is the inverse of the information,
+        because a jackknife over few groups may be small by chance. With fewer than `MIN_GROUPS`
+        groups, only the prior is used. The result is then None if the self-calibration has not yet
         replaced the initial prior.
         """
         if len(self.groups) < MIN_GROUPS:

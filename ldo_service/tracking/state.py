@@ -68,7 +68,7 @@ class OdometryState:
 
     @property
     def is_relayed(self) -> bool:
-        """True if the frame to which new frames are aligned, the reference, is no keyframe."""
+        """True if the reference, to which new frames are aligned, is not a keyframe."""
         return self.keyframe is not None and self.keyframe.relay is not None
 
     def records_of_other_submaps(self, submap: int) -> KeyframeDatabase:
@@ -89,7 +89,7 @@ class OdometryState:
 
         Args:
             T_odom_camera: Pose of the frame, [4, 4].
-            alignment: Its alignment to the reference keyframe.
+            alignment: Alignment of the frame to the reference keyframe.
             median_depth_m: Median depth of the reference keyframe.
             config: Settings.
         """
@@ -171,9 +171,10 @@ class OdometryState:
         return replace(self, keyframe=reference, motion_evidence=evidence, shutter=shutter)
 
     def recorrected(self, change: CorrectionChange, config: PyramidConfig) -> "OdometryState":
-        """Return the state with all keyframes and records converted to a new camera correction.
+        """Return the state for a new correction of vignetting and depth bias.
 
-        The residual history is cleared, because the noise may differ from now on.
+        All keyframes and records are converted to the new correction. The residual history is
+        cleared, because the noise may differ from now on.
         """
         keyframe, mapped = self.keyframe, self.mapping_keyframe
         return replace(
@@ -188,14 +189,14 @@ class OdometryState:
     def informed(
         self, camera: CameraKnowledge, pyramid: PyramidConfig, config: ShutterConfig
     ) -> "OdometryState":
-        """Return the state before a frame, with new estimates of the camera.
+        """Return the state with new estimates of the self-calibration, for the next frame.
 
-        Frames are compensated with the current timing of the shutter. If the reference was
-        compensated with another timing, it is compensated again, because otherwise it would be
-        distorted relative to the frames.
+        Frames are compensated with the current shutter timing. If the reference was compensated
+        with another timing, the reference is compensated again. Otherwise, it would be distorted
+        relative to the frames.
 
         Args:
-            camera: Estimates of the self-calibration.
+            camera: New estimates of the self-calibration, such as the shutter timing.
             pyramid: Settings of the pyramid.
             config: Settings of the shutter.
         """
@@ -226,7 +227,7 @@ class OdometryState:
 def pack(state: OdometryState) -> dict[str, Any]:
     """Return the state as arrays and plain values, for a checkpoint.
 
-    A keyframe is packed as gray image, depth, pose and masks. `unpack` computes everything else.
+    The image pyramid of a keyframe is not packed; `unpack` computes it from gray image and depth.
     """
     return {
         "places": [record.pack() for record in state.database.all],

@@ -49,8 +49,8 @@ class SubmapConfig:
         if self.begin_after_frames < 0 or min(self.search_interval_frames, self.confirm_after) < 1:
             raise ConfigError(
                 f"SubmapConfig.begin_after_frames={self.begin_after_frames} must be at least 0, "
-                f"search_interval_frames={self.search_interval_frames} and "
-                f"confirm_after={self.confirm_after} at least 1."
+                f"and search_interval_frames={self.search_interval_frames} and "
+                f"confirm_after={self.confirm_after} must be at least 1."
             )
         if not -1 <= self.max_view_correlation <= 1:
             raise ConfigError(
@@ -60,7 +60,8 @@ class SubmapConfig:
         if not (self.confirm_rad > 0 and self.confirm_apart_rad >= 0 and self.misses >= 0):
             raise ConfigError(
                 f"SubmapConfig.confirm_rad={self.confirm_rad:g} must be positive, "
-                f"confirm_apart_rad={self.confirm_apart_rad:g} and misses={self.misses} at least 0."
+                f"and confirm_apart_rad={self.confirm_apart_rad:g} and misses={self.misses} must "
+                "be at least 0."
             )
 
 
@@ -135,7 +136,7 @@ class SubmapMatch:
 
 @dataclass(frozen=True, slots=True)
 class Submaps:
-    """Merged submaps, and the state of the search for further merges."""
+    """Record of which submaps are merged, and state of the search for further merges."""
 
     # Oldest submap that each submap is merged with, or the submap itself if it is not merged.
     roots: tuple[int, ...] = ()
@@ -163,7 +164,7 @@ class Submaps:
 
         Args:
             thumbnail: Thumbnail of the frame, [300] int8; None if the frame has too little depth
-                to search the keyframes for its place.
+                for relocalization.
             config: Settings.
         """
         after = replace(self, frames_since_search=self.frames_since_search + 1)
@@ -179,7 +180,7 @@ class Submaps:
         )
 
     def should_start(self, config: SubmapConfig) -> bool:
-        """Return whether to start a submap, because relocalization of many LOST frames failed."""
+        """Return whether relocalization failed for so many LOST frames that a submap starts."""
         count = max(self.lost_frames, FRAMES_PER_VIEW * self.lost_views)
         return 0 < config.begin_after_frames <= count
 
@@ -211,8 +212,9 @@ class Submaps:
     def with_search_result(self, found: SubmapMatch | None, config: SubmapConfig) -> "Submaps":
         """Return the state after a search of the other submaps.
 
-        The pending match stays if the new match is consistent with it; `is_confirmed_by` says
-        whether the two merge the submaps. Otherwise, the new match becomes the pending match.
+        If the new match is consistent with the pending match, the pending match stays. Otherwise,
+        the new match becomes the pending match. `is_confirmed_by` decides whether both matches
+        together are enough to merge the submaps.
 
         Args:
             found: The match, or None if the search found none. More than `config.misses` searches
@@ -238,7 +240,7 @@ class Submaps:
         )
 
     def with_merge(self, submap: int, other: int) -> "Submaps":
-        """Return the state with two submaps merged; the older one becomes the root of both."""
+        """Return the state with two submaps merged; the oldest submap becomes the root of both."""
         older, younger = sorted((self.roots[submap], self.roots[other]))
         roots = tuple(older if root == younger else root for root in self.roots)
         return replace(self, roots=roots, pending_match=None)

@@ -1,13 +1,14 @@
 """Tracking status from the quality of an alignment.
 
-Inlier fractions do not detect that alignment converged to a wrong local minimum. The estimated
-noise is so large there that every residual counts as an inlier. The status therefore depends on
-other measures: overlap with the reference keyframe, noise relative to its running median, condition
-number of the information, and confirmation by features or GICP.
+The fraction of inliers does not show that alignment converged to a wrong local minimum. The
+estimated residual noise is then so large that every residual counts as an inlier. The status
+therefore depends on other measures: overlap with the reference keyframe, residual noise relative to
+its running median, condition number of the information matrix, and confirmation by ORB features or
+GICP.
 
-The noise also grows at right poses: after blur, a change of exposure, at a steep view, or after a
-large motion. Features have errors of another kind, so a pose that is closely confirmed by features
-is accepted with more noise.
+The residual noise of a correct pose grows too: with blur, a change of exposure, a steep viewing
+angle or a large motion. Features have errors of another kind. A pose that is close to the pose by
+features is therefore accepted with more noise.
 """
 
 from dataclasses import dataclass, replace
@@ -26,7 +27,7 @@ MIN_GAIN = 0.05  # Lower bound of the gain that noise is divided by; a darker fr
 
 
 class TrackingStatus(StrEnum):
-    """Tracking status of a frame."""
+    """Tracking status of a frame: OK, WEAK or LOST."""
 
     OK = "OK"
     WEAK = "WEAK"  # The pose is known, but not reliable enough for mapping.
@@ -84,8 +85,9 @@ class TrackingQualityConfig:
     def __post_init__(self) -> None:
         if not 0 <= self.lost_overlap <= self.min_overlap <= 1:
             raise ConfigError(
-                f"TrackingQualityConfig.lost_overlap={self.lost_overlap:g} must be within 0..1 and "
-                f"at most min_overlap={self.min_overlap:g}, which must be at most 1."
+                f"TrackingQualityConfig.lost_overlap={self.lost_overlap:g} and "
+                f"min_overlap={self.min_overlap:g} must satisfy "
+                "0 <= lost_overlap <= min_overlap <= 1."
             )
         if not 1 < self.weak_residual <= self.lost_residual:
             raise ConfigError(
@@ -100,30 +102,31 @@ class TrackingQualityConfig:
         if self.relocalized_residual < 1 or self.relocalized_residual_per_rad < 0:
             raise ConfigError(
                 f"TrackingQualityConfig.relocalized_residual={self.relocalized_residual:g} must be "
-                "at least 1, "
-                f"relocalized_residual_per_rad={self.relocalized_residual_per_rad:g} at least 0."
+                "at least 1, and "
+                f"relocalized_residual_per_rad={self.relocalized_residual_per_rad:g} must be at "
+                "least 0."
             )
         if not 0 < self.recovery_margin <= 1 or self.history < 1:
             raise ConfigError(
-                f"TrackingQualityConfig.recovery_margin={self.recovery_margin:g} must be within "
-                f"0..1 and history={self.history} at least 1."
+                f"TrackingQualityConfig.recovery_margin={self.recovery_margin:g} must be above 0 "
+                f"and at most 1, and history={self.history} must be at least 1."
             )
 
 
 @dataclass(frozen=True, slots=True)
 class ResidualHistory:
-    """Photometric and geometric noise of the last OK frames, oldest first."""
+    """Photometric and geometric residual noise of the last OK frames, oldest first."""
 
     # Photometric noise, in gray levels as the image of the reference keyframe has them.
     intensity_sigmas: tuple[float, ...] = ()
     depth_noise_scales: tuple[float, ...] = ()  # Geometric noise, multiples of `DepthNoise`.
 
     def extended(self, alignment: Alignment, config: TrackingQualityConfig) -> "ResidualHistory":
-        """Return the history with the noise of one more alignment.
+        """Return the history with the residual noise of one more alignment.
 
-        The noise is limited to `weak_residual` times the running median. A pose that
-        is confirmed by features may have more noise. A few such frames must not hide a wrong pose
-        after them.
+        The added noise is limited to `weak_residual` times the running median. The noise of a pose
+        that features confirm may exceed this limit. Without the limit, a few such poses would raise
+        the median, and a wrong pose in a later frame would not stand out.
         """
         keep, sigma = config.history - 1, exposure_corrected_sigma(alignment)
         usual_sigma, usual_scale = self._usual(config)
@@ -144,9 +147,9 @@ class ResidualHistory:
         )
 
     def residual_ratio(self, alignment: Alignment, config: TrackingQualityConfig) -> float:
-        """Return the ratio of the noise of an alignment to its running median.
+        """Return the residual noise of an alignment, divided by the running median.
 
-        The result is the larger one of the photometric and the geometric ratio.
+        The result is the larger of two ratios: photometric noise and geometric noise.
         """
         intensity, depth = self._usual(config)
         return max(
@@ -155,9 +158,10 @@ class ResidualHistory:
 
 
 def exposure_corrected_sigma(alignment: Alignment) -> float:
-    """Return the photometric noise divided by the gain, in gray levels of the reference.
+    """Return the photometric noise of an alignment, in gray levels of the reference keyframe.
 
-    Noise in gray levels of the frame grows with its exposure.
+    Noise in gray levels of the frame grows with the exposure of the frame. The function therefore
+    divides this noise by the gain of the alignment.
     """
     return alignment.intensity_sigma / max(alignment.gain, MIN_GAIN)
 
@@ -168,17 +172,17 @@ def classify_tracking(
     previous: TrackingStatus,
     config: TrackingQualityConfig,
 ) -> TrackingStatus:
-    """Return the tracking status of a frame by the quality of its best alignment.
+    """Return the tracking status of a frame from the quality of its best alignment.
 
     The limits have hysteresis. They are stricter after a WEAK frame, unless an independent estimate
     (features or GICP) confirms the pose. They are strictest after a LOST frame, unless such an
     estimate and the odometry prior both confirm the pose. The status changes from LOST to OK
-    directly, never to WEAK. A pose that is closely confirmed by features may have a larger
-    residual, except after a LOST frame.
+    directly, never to WEAK. A pose within `config.confirmed_rad` of the pose by features may have
+    more residual noise, except after a LOST frame.
 
     Args:
-        candidate: Best hypothesis of the frame.
-        history: Noise of the last OK frames.
+        candidate: Best pose hypothesis of the frame.
+        history: Residual noise of the last OK frames.
         previous: Status of the previous frame.
         config: Limits.
     """

@@ -26,9 +26,9 @@ class KeyframeKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class TrackedFrame:
-    """Pose of a frame relative to its reference, and the kind of keyframe it should become.
+    """Tracked pose of a frame, and the kind of keyframe that the frame should become.
 
-    While the status is LOST, the pose is the last accepted one and `information` is zero.
+    While the status is LOST, the pose is the last accepted pose, and `information` is zero.
     """
 
     status: TrackingStatus
@@ -69,16 +69,18 @@ class TrackedFrame:
         hypothesis_spread_rad: float = 0.0,
         dynamic_mask: np.ndarray | None = None,
     ) -> "TrackedFrame":
-        """Return the result of an alignment to a keyframe.
+        """Return the tracked frame that results from an alignment to a keyframe.
 
         Args:
-            alignment: The alignment of the frame to the keyframe.
-            T_odom_camera: Pose of the camera, [4, 4].
+            alignment: The alignment of the frame to the keyframe or to its relay.
+            T_odom_camera: Pose of the camera in the odometry frame, [4, 4].
             keyframe: The reference keyframe.
             status: Tracking status of the frame.
             pose_source: Name of the initial guess that the alignment started from.
-            needed_keyframe: The kind of keyframe that the frame should become; None if none.
-            hypothesis_spread_rad: Distance to the farthest other pose that the images support.
+            needed_keyframe: Kind of keyframe that the frame should become; None if it should not
+                become one.
+            hypothesis_spread_rad: Distance to the farthest other pose that the images support, as
+                `image_motion_rad`; 0 if there is none.
             dynamic_mask: Dynamic pixels, [H, W] bool at the finest pyramid level; None if unknown.
         """
         T_reference_camera, information = alignment.T_reference_camera, alignment.information
@@ -106,16 +108,16 @@ class TrackedFrame:
         )
 
     def relay(self) -> Relay:
-        """Return the pose of the frame in its keyframe as a relay.
+        """Return this frame as a relay, with its pose relative to its keyframe.
 
-        A relay is a frame that later frames are aligned to although it is no keyframe.
+        A relay is a frame to which later frames are aligned, although it is not a keyframe.
         """
         return Relay(self.T_reference_camera, covariance_of(self.information))
 
 
 @dataclass(frozen=True, slots=True)
 class NewKeyframe:
-    """Keyframe that was made of a frame."""
+    """Keyframe that was made from a frame."""
 
     id: int
     kind: KeyframeKind
@@ -128,9 +130,9 @@ class NewKeyframe:
 
 @dataclass(frozen=True, slots=True)
 class TrackingResult:
-    """Pose of a frame in odometry and in the map, and the keyframe made of it.
+    """Result of tracking a frame: poses in odometry and in the map, quality, and keyframe.
 
-    While the status is LOST, the pose is the last accepted one and `information` is zero.
+    While the status is LOST, the pose is the last accepted pose, and `information` is zero.
     """
 
     # Pose.
@@ -190,23 +192,25 @@ def make_tracking_result(
     denied_keyframe: KeyframeKind | None = None,
     awaits_mapping: bool = False,
 ) -> TrackingResult:
-    """Return the result of a tracked frame, with its pose in the map.
+    """Return the result of tracking a frame, with its pose in the map.
 
     Args:
-        tracked: The frame in odometry.
-        T_map_odom: Odometry frame in the map, [4, 4]; its rotation is orthonormalized here.
+        tracked: The tracked frame, with its pose in the odometry frame.
+        T_map_odom: Pose of the odometry frame in the map, [4, 4]. This function orthonormalizes the
+            rotation.
         graph_version: Version of the pose graph that T_map_odom comes from.
-        submap: The oldest submap that the pose graph has merged with the frame's submap.
-        reference: Id of the keyframe that the pose refers to; None before any keyframe.
+        submap: Id of the oldest submap that the pose graph has merged with the frame's submap.
+        reference: Id of the keyframe that the pose is relative to; None if there is none.
         has_prior: True if the odometry prior covers the time of the frame.
         motion: Motion of the camera during the frame; None if unknown.
-        shutter: Timing of the shutter after the frame.
-        keyframe: The new keyframe made of the frame; None if none was made.
-        reused_keyframe: Id of the known keyframe that is the reference from now on; None if none.
-        denied_keyframe: Kind of keyframe that was needed but that the caller of `Odometry.process`
-            did not allow; None otherwise.
-        awaits_mapping: True if odometry has not started, because the caller did not allow a
-            keyframe of its first frame.
+        shutter: State of the shutter compensation after this frame.
+        keyframe: The keyframe made from the frame; None if none was made.
+        reused_keyframe: Id of an earlier keyframe that becomes the reference keyframe again; None
+            if none is reused.
+        denied_keyframe: Kind of keyframe that was needed, but that the caller of
+            `Odometry.process` did not allow; None if no keyframe was denied.
+        awaits_mapping: True if odometry has not started, because the caller did not allow the
+            first keyframe.
     """
     return TrackingResult(
         status=tracked.status,

@@ -23,7 +23,7 @@ from .pyramid import PyramidConfig
 
 @dataclass(frozen=True, slots=True)
 class WindowConfig:
-    """Settings of the measurements of a new keyframe from earlier ones."""
+    """Settings for measuring a new keyframe relative to earlier keyframes."""
 
     # Maximum number of measurements per keyframe; 0: none. A larger number changes the result
     # little, and each measurement takes 4 ms.
@@ -42,12 +42,12 @@ class WindowConfig:
         if self.measurements < 0 or min(self.reach, self.levels) < 1:
             raise ConfigError(
                 named(self, "measurements", "reach", "levels")
-                + ": measurements must be at least 0, reach and levels at least 1."
+                + ": measurements must be at least 0; reach and levels must be at least 1."
             )
         if not (0 < self.min_overlap <= 1 and self.max_noise >= 1):
             raise ConfigError(
                 named(self, "min_overlap", "max_noise")
-                + ": min_overlap must be within 0..1, max_noise at least 1."
+                + ": min_overlap must be above 0 and at most 1, and max_noise must be at least 1."
             )
         if not self.iterations or min(self.iterations) < 1:
             raise ConfigError(
@@ -95,11 +95,11 @@ def measure_against(
     Args:
         earlier: Earlier keyframes in order of preference.
         keyframe: The new keyframe.
-        usual: Brightness change and noise of the tracked frame. Each alignment starts from these
-            values, and `config.max_noise` is a multiple of this noise.
+        usual: Brightness change and residual noise of the tracked frame. Each alignment starts from
+            these values. A measurement may have at most `config.max_noise` times this noise.
         align_config: Settings of alignment.
-        config: Settings.
-        aligner: Device of the alignment.
+        config: Settings of the measurements.
+        aligner: Aligner on the CPU or on a GPU.
 
     Returns:
         At most `config.measurements` relative poses.

@@ -9,9 +9,10 @@
 | `operator` | Reads every topic; sends commands, refine requests     |
 |            | and label names.                                       |
 
-Clients without an entry may connect, but the router denies all their messages. The router also
-denies a request whose keys the rules allow only in part. A viewer that subscribes to
-`ldo/robot/**` therefore receives nothing; it must subscribe to topics by name.
+A client whose certificate is not in `access.yaml` may connect, but the router denies all messages
+of this client. A key with wildcards may match some topics that a role may not use. The router then
+denies the whole request. A viewer that subscribes to `ldo/robot/**` therefore receives nothing. It
+must subscribe to topics by name.
 
 `access.yaml` maps the common name of each certificate to its role, robot and last valid day:
 
@@ -71,7 +72,7 @@ Access = Mapping[str, AccessEntry]  # Entry by common name of the certificate.
 
 
 def read_access(path: Path) -> dict[str, AccessEntry]:
-    """Read `access.yaml`.
+    """Read the role of each certificate from `access.yaml`.
 
     Raises:
         ConfigError: The file cannot be read or is malformed.
@@ -95,9 +96,9 @@ def access_control(access: Access, local_robot: str = "") -> dict[str, Any]:
 
     Args:
         access: Role of each certificate.
-        local_robot: Robot whose child processes connect over a Unix socket, with permission for
-            all operations; empty if there is none. Only the user of the service can open the
-            socket.
+        local_robot: Name of the robot if child processes of the service connect over a Unix socket;
+            otherwise empty. These processes may perform all operations, because only the user who
+            runs the service can open the socket.
     """
     parts: dict[tuple[Role, str], list[str]] = {}
     for name, grantee in sorted(access.items()):
@@ -120,9 +121,9 @@ def access_control(access: Access, local_robot: str = "") -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """Rule that allows some kinds of messages on some keys.
+    """Access rule that allows some kinds of Zenoh messages on some keys.
 
-    Messages from the client to the router are "ingress"; messages from the router to the client are
+    Messages from a client to the router are "ingress". Messages from the router to a client are
     "egress".
     """
 
@@ -132,7 +133,7 @@ class Rule:
     keys: tuple[str, ...]  # Zenoh key expressions, relative to the robot.
 
     def for_robot(self, robot: str, part: str) -> dict[str, Any]:
-        """Return the rule in Zenoh's format; `part` is the prefix of the rule's id."""
+        """Return the rule for a robot in Zenoh's format; `part` is the prefix of the rule's id."""
         return {
             "id": f"{part}: {self.name}",
             "permission": "allow",
@@ -143,7 +144,7 @@ class Rule:
 
 
 def rules_of(role: Role) -> Iterator[Rule]:
-    """Yield the rules of a role."""
+    """Yield the access rules of a role."""
     if role == "service":
         yield Rule("all operations", ("ingress", "egress"), EVERYTHING, ("**",))
     if role in PUTS:

@@ -3,13 +3,13 @@
 The folder DIR of an authority contains:
 
 - `DIR/ca.crt`, `DIR/ca.key`: Certificate and private key of the authority. No robot needs the
-  private key, so it stays here.
+  private key, so it stays in this folder.
 - `DIR/access.yaml`: Role of each certificate. The folder of each service has a copy.
 - `DIR/<name>/`: Files for one machine: ca.crt, tls.crt, tls.key.
 
-The common name of a certificate consists of the name of its keys and a random number. New keys with
-the name of old keys therefore have another common name. Routers with the new access list deny the
-old keys.
+The common name of a certificate consists of the name of its keys and a random number. If removed
+keys are created again under the same name, their common name therefore differs. Routers with the
+new access list deny the old keys.
 """
 
 import os
@@ -125,9 +125,9 @@ class CertificateAuthority:
         """Issue new keys and add them to the access list.
 
         Args:
-            name: Name of the keys, for example of the machine.
+            name: Name of the keys, for example the name of the machine.
             role: Role of the certificate.
-            robot: Name of the robot, or EVERY_ROBOT.
+            robot: Name of the robot; EVERY_ROBOT for all robots.
             days: Validity of the certificate, days.
             hosts: Host names and IP addresses at which clients reach a service; empty for other
                 roles.

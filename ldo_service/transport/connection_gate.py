@@ -1,24 +1,26 @@
-"""Gate in front of the TLS port of the router, run as a process of its own.
+"""Gate in front of the TLS port of the router, run as a separate process.
 
-Zenoh accepts any number of TCP connections to a TLS port. Each takes a file descriptor of the
-service until its handshake times out, and after each failed handshake Zenoh accepts no connection
-for 0.1 s. The gate therefore owns the port that other machines see, and passes bytes on to the port
-of the router on loopback. It does not decrypt them: programs and router check each other's
-certificates as they do without a gate.
+Zenoh accepts any number of TCP connections to a TLS port. Each connection takes a file descriptor
+of the service until its TLS handshake times out. After each failed handshake, Zenoh accepts no
+connection for 0.1 s. The gate therefore listens on the port that other machines see, and passes all
+bytes on to a loopback port of the router. The gate does not decrypt the bytes: programs and router
+check each other's certificates as they do without a gate.
 
-A connection is *unproven* until the router has accepted the client's certificate. The gate
+A connection is *unproven* until the router has accepted the certificate of its client. The gate
+limits unproven connections as follows:
 
-- passes nothing on before the first bytes of a TLS handshake have arrived,
-- closes a connection that is unproven for longer than `HANDSHAKE_S`,
-- closes an unproven connection when there are more than `MAX_UNPROVEN`: one of the address with
-  the most unproven connections, and if possible one that has sent nothing,
-- lets at most `MAX_HANDSHAKES` connections of an address, and `MAX_ALL_HANDSHAKES` in all, shake
-  hands with the router at a time.
+- The gate passes nothing on before the first bytes of a TLS handshake have arrived.
+- The gate closes a connection that is unproven for longer than `HANDSHAKE_S`.
+- If more than `MAX_UNPROVEN` connections are unproven, the gate closes one of them. It chooses one
+  of the address that has the most, and prefers a connection that has sent nothing.
+- At most `MAX_HANDSHAKES` connections of one address are in a handshake with the router at the same
+  time. For all addresses together, the limit is `MAX_ALL_HANDSHAKES`.
 
-This file runs as a script and imports the standard library only, so that the process starts at once
-and takes little memory: `python -I connection_gate.py DESCRIPTOR HOST PORT MAX_CONNECTIONS`. A line
-on its standard input is a new port of the router. The process ends when its standard input ends. It
-prints how many connections it closed because of these limits, at most once in `REPORT_S`.
+This file runs as a script: `python -I connection_gate.py DESCRIPTOR HOST PORT MAX_CONNECTIONS`.
+DESCRIPTOR is the listening socket; HOST and PORT are the address of the router. The script imports
+the standard library only, so that the process starts at once and takes little memory. Each line on
+its standard input is a new port of the router. The process ends when its standard input ends. At
+most once in `REPORT_S`, it prints the number of connections that it closed because of the limits.
 """
 
 import asyncio
@@ -84,7 +86,10 @@ class Connection:
             self._gate.wait_for_turn(self)
 
     def from_router(self, data: bytes) -> None:
-        """Pass bytes from the router to the client; detect its answer to the certificate."""
+        """Pass bytes from the router to the client.
+
+        The answer of the router shows whether it has accepted the certificate of the client.
+        """
         if not self._has_router_spoken:
             self._has_router_spoken = HELLO_RETRY not in data[:64]
         elif self._has_client_answered and not self.is_proven:
@@ -177,8 +182,8 @@ class Side(asyncio.Protocol):
 class Gate:
     """Gate between clients on the network and the TLS port of the router; see the module.
 
-    It limits the connections that are unproven: the router has not accepted the certificate of
-    their client.
+    A connection is unproven until the router has accepted the certificate of its client. The gate
+    limits the number of unproven connections.
     """
 
     def __init__(self, host: str, port: int, max_connections: int) -> None:
@@ -232,20 +237,21 @@ class Gate:
             connection.close()
 
     def wait_for_turn(self, connection: Connection) -> None:
-        """Connect to the router as soon as few enough handshakes are under way.
+        """Queue a connection until the number of running handshakes permits another one.
 
-        The limits are `MAX_HANDSHAKES` for the client's address, and `MAX_ALL_HANDSHAKES` in all.
+        The gate then connects to the router for this client. At most `MAX_HANDSHAKES` handshakes
+        run for one client address, and at most `MAX_ALL_HANDSHAKES` for all addresses.
         """
         self._waiting[connection] = None
         self._start_waiting()
 
     def end_handshake(self, connection: Connection) -> None:
-        """Remove a connection from those in a handshake, and let the next one connect."""
+        """Count the handshake of a connection as ended, and let the next connection start."""
         self._handshakes.pop(connection, None)
         self._start_waiting()
 
     def forget(self, connection: Connection) -> None:
-        """Remove a closed connection."""
+        """Remove a closed connection from the lists of the gate."""
         self._open.pop(connection, None)
         self._waiting.pop(connection, None)
 

@@ -47,8 +47,8 @@ class Endpoint:
         is_tls = self.endpoint.startswith("tls/")
         if is_tls and self.keys is None:
             raise ConfigError(
-                f"endpoint {self.endpoint} needs keys. Create them by `ldo keys` and name their "
-                "folder by --keys."
+                f"endpoint {self.endpoint} uses TLS and needs keys. Create keys with `ldo keys`, "
+                "and give their folder with --keys."
             )
         if self.keys is not None and not is_tls:
             raise ConfigError(

@@ -2,25 +2,26 @@
 
 - `ConsumerHello` (consumer to producer): Announces the consumer. It is repeated until the producer
   sends its hello.
-- `ProducerHello` (producer to consumers): Epoch of the producer, and the offset of the first
-  message for each consumer that the producer knows. Each consumer replies immediately: with its
-  credit, or with a hello if it is not connected yet.
-- `Credit` (consumer to producer): Three offsets, sent after each step and twice a second. Message
-  `handled` is the first one that the consumer has not handled. Message `arrived` is the first one
-  that the consumer has not received. Message `limit` is the first one that the producer may not
-  send yet.
+- `ProducerHello` (producer to consumers): Announces the producer. It contains the epoch, which
+  changes when the message numbers restart at 0. For each consumer that the producer knows, it
+  contains the offset of the first message that is sent to this consumer. Each consumer replies
+  immediately: with its credit, or with a hello if it is not connected yet.
+- `Credit` (consumer to producer): Three message offsets, sent after each handled message and twice
+  a second. `handled` is the offset of the first message that the consumer has not handled.
+  `arrived` is the offset of the first message that has not arrived. `limit` is the offset of the
+  first message that the producer may not send yet.
 
-Each of these messages has the complete state of its sender, not a change. It may therefore be lost,
-repeated or replaced by a newer one.
+Each of these three messages contains the complete state of its sender, not a change of the state.
+It may therefore be lost, repeated or replaced by a newer one.
 
 The producer keeps a message until all consumers have handled it, and waits when a consumer has a
 full window of unhandled messages. It does not wait for a consumer with policy `Backlog`: it stores
-the unhandled messages of such a consumer on disk. The producer retransmits messages from `arrived`
-on when a credit message reports a gap, or when a message is overdue. A restarted consumer receives
-the messages that it had not handled. Producer and consumer each save their position in one write
-with the actor's state (`runtime.delivery_state`). Each message therefore takes effect exactly once,
-even if either process is killed at any time. `SequenceTracker` counts lost messages by their
-sequence numbers.
+the unhandled messages of such a consumer on disk. The producer retransmits all messages from offset
+`arrived` on in two cases: a credit reports a gap, or that message has not arrived in time. A
+restarted consumer receives the messages that it had not handled. Producer and consumer each save
+their position in one write with the actor's state (`runtime.delivery_state`). Each message
+therefore takes effect exactly once, even if either process is killed at any time. `SequenceTracker`
+counts lost messages by their sequence numbers.
 """
 
 import secrets
@@ -73,7 +74,7 @@ EXTERNAL_HEADER = Header("outside", 1, 0, 0)
 
 
 class ConsumerHello(msgspec.Struct, frozen=True, tag="join", array_like=True):
-    """Handshake of a consumer."""
+    """Handshake message from a consumer to a producer."""
 
     consumer: str
     has_backlog: bool = False  # True: the producer does not wait for the consumer's credit.
@@ -100,7 +101,7 @@ class Credit(msgspec.Struct, frozen=True, tag="grant", array_like=True):
 
 
 class ProducerHello(msgspec.Struct, frozen=True, array_like=True):
-    """Handshake of a producer."""
+    """Handshake message from a producer to its consumers."""
 
     epoch: int  # Epoch of the producer.
     starts: dict[str, int]  # Offset of the first message for each known consumer, by name.
@@ -171,13 +172,13 @@ def data_key(topic: str) -> str:
 def retransmit_key(topic: str, consumer: str = "") -> str:
     """Return the key of retransmitted messages.
 
-    Only lossless consumers subscribe to this key. Other consumers get no message twice.
+    Only lossless consumers subscribe to this key, so other consumers get no message twice.
 
     Args:
         topic: Name of the topic.
         consumer: Name of a consumer with policy `Backlog`. Each such consumer has its own key, so
-            that no other consumer receives its backlog. Empty for the key that all other lossless
-            consumers share.
+            that no other consumer receives its backlog. If the name is empty, the result is the key
+            that all other lossless consumers share.
     """
     return f"link/again/{topic}/{consumer}" if consumer else f"link/again/{topic}"
 
@@ -207,7 +208,7 @@ class SequenceTracker:
         self._missing: dict[int, None] = {}  # Offsets of missing messages, in order.
 
     def observe(self, header: Header) -> bool:
-        """Count the messages lost before this one; return False for a repeated message."""
+        """Count the messages lost before a message; return False if the message is repeated."""
         if (header.source, header.epoch) != self._producer:
             self._producer, self._next = (header.source, header.epoch), header.seq
             self._missing.clear()

@@ -30,17 +30,18 @@ DESCRIPTORS_PER_CONNECTION = 4
 
 @contextmanager
 def guarded(network: Endpoint) -> Iterator[tuple[Endpoint, "GateProcess | None"]]:
-    """Run the gate of a router with TLS keys while the block runs.
+    """Open a context in which a gate runs in front of a router with TLS keys.
 
     The gate limits the connections of programs without keys; see `connection_gate`.
 
     Args:
-        network: Endpoint of the router. The gate listens on its address, and passes connections on
-            to the router on another port.
+        network: Endpoint to which clients connect. The gate listens on this endpoint, and passes
+            connections on to a loopback port of the router.
 
     Yields:
-        The endpoint with the port for the router, and the gate. If the address has more than host
-        and port, such as `#iface=eth0`, there is no gate, and `network` and None are yielded.
+        The endpoint with the loopback port on which the router must listen, and the gate. If
+        settings such as `#iface=eth0` follow the port of the endpoint, no gate runs. The result is
+        then `network` and None.
 
     Raises:
         UnavailableError: The address is in use or does not exist.

@@ -1,4 +1,4 @@
-"""Network interface of the runtime, and an implementation in memory."""
+"""Interface between the runtime and the network, and an implementation in memory."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Sequence
@@ -17,7 +17,8 @@ class Publisher(Protocol):
     def send(self, header: bytes, body: bytes) -> Awaitable[None]:
         """Send a message.
 
-        The returned awaitable is done when the message was sent or dropped because of congestion.
+        The returned awaitable is done when the message has been sent, or dropped because of
+        congestion.
         """
         ...
 
@@ -58,9 +59,10 @@ class Transport(Protocol):
         ...
 
     def serve_queries(self, key: str, last_values: LastValues) -> None:
-        """Reply to queries on a key with the parts that `last_values` returns.
+        """Reply to each query on a key with the messages that `last_values` returns.
 
-        All parts have the same key, so a Zenoh query needs consolidation NONE to get all of them.
+        All these messages have the same key. A Zenoh query therefore needs consolidation NONE to
+        get all of them.
         """
         ...
 
@@ -76,7 +78,7 @@ def call_soon(loop: asyncio.AbstractEventLoop, callback: Callable[..., None], *a
 
 
 class MemoryTransport:
-    """Transport in memory, for stages in one event loop; delivery is immediate."""
+    """Transport in memory, for actors in one event loop; delivery is immediate."""
 
     def __init__(self, lose: Callable[[str], bool] = lambda _key: False) -> None:
         """Initialize without subscribers.
@@ -96,7 +98,7 @@ class MemoryTransport:
         return MemoryPublisher(self, key)
 
     def deliver(self, key: str, header: bytes, body: bytes) -> None:
-        """Call the subscribers of a key, unless `lose` returns True for the key."""
+        """Deliver a message to the subscribers of a key, unless `lose` is True for the key."""
         if not self._lose(key):
             for on_message in list(self._subscribers.get(key, ())):
                 on_message(header, memoryview(body))
@@ -106,7 +108,7 @@ class MemoryTransport:
         self._subscribers.setdefault(key, []).append(on_message)
 
     def declare_liveliness(self, name: str) -> None:
-        """Declare an actor alive until `leave`."""
+        """Declare an actor alive until `leave` is called."""
         self._alive.append(name)
         for on_presence in self._watchers:
             on_presence(name, True)
@@ -124,11 +126,11 @@ class MemoryTransport:
             on_presence(name, True)
 
     def serve_queries(self, key: str, last_values: LastValues) -> None:
-        """Reply to queries on a key with the parts that `last_values` returns."""
+        """Reply to each query on a key with the messages that `last_values` returns."""
         self._answers[key] = last_values
 
     def query(self, key: str) -> Sequence[tuple[bytes, bytes]]:
-        """Return header and body of each message of the last value of a key; empty without one."""
+        """Return header and body of each message that replies to a query; empty if none does."""
         return self._answers[key]() if key in self._answers else ()
 
     def close(self) -> None:

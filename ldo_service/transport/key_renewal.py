@@ -1,9 +1,10 @@
 """Renewal of the TLS keys of a running router.
 
-Zenoh reads keys and access list when a session opens. If the files change, `KeyRenewal` opens a
-second router with the new files, and connects it to the router of the service over the Unix socket.
-The gate (`connection_gate`), to which programs connect, then closes their connections and passes
-new ones on to the second router. Programs connect again by themselves.
+Zenoh reads the keys and the access list only when a session opens. If the files change,
+`KeyRenewal` opens a second router with the new files. A Unix socket connects the second router to
+the router of the service. Other programs connect to the gate (`connection_gate`). The gate then
+closes their connections, and passes new connections on to the second router. The programs connect
+again by themselves.
 """
 
 import logging
@@ -28,9 +29,9 @@ Stamps = tuple[tuple[int, ...], ...]  # Number, time and size of each file.
 
 
 class KeyRenewal:
-    """Thread that watches the files of a router's keys, for a `with` block.
+    """Context manager whose thread watches the key files of a router and renews the keys.
 
-    Once a day it also warns of a certificate that expires soon.
+    Once a day, the thread also logs a warning if the certificate expires soon.
     """
 
     # Time between two checks of the files, seconds. Changed files are read only after two checks

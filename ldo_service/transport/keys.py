@@ -38,7 +38,7 @@ OF_CLIENT = "This program cannot connect after that."
 def expiry_warning(valid_until_s: float | None) -> str:
     """Return "expires in ... days" or "expired ... days ago" if a warning is due, else "".
 
-    A warning is due from `EXPIRY_WARNING_DAYS` before the end of the validity.
+    A warning is due if the certificate is valid for at most `EXPIRY_WARNING_DAYS` more days.
 
     Args:
         valid_until_s: End of the validity of a certificate, Unix time in seconds; None if unknown.
@@ -52,12 +52,13 @@ def expiry_warning(valid_until_s: float | None) -> str:
 
 
 def router_settings(folder: Path, access: Access, local_robot: str = "") -> dict[str, Any]:
-    """Return the Zenoh settings, by path, of a router with its keys in `folder`.
+    """Return the Zenoh settings of a router, with the path of each setting as key.
 
     Args:
-        folder: The folder with the keys.
+        folder: The folder with the TLS keys of the router.
         access: Role of each certificate.
-        local_robot: Robot whose child processes connect over a Unix socket; empty: none.
+        local_robot: Name of the robot if child processes of the service connect over a Unix socket;
+            otherwise empty.
     """
     tls = {"transport/link/tls": _tls(folder, "listen")}
     return {**tls, "access_control": access_control(access, local_robot)}
@@ -96,16 +97,18 @@ class TlsKeys:
         if mode & OTHERS:
             raise ConfigError(
                 f"{self.folder / KEY} is readable by all users of this machine. Run "
-                f"`chmod 600 {self.folder / KEY}`, and create new keys if another user read it."
+                f"`chmod 600 {self.folder / KEY}`, and create new keys if another user has read "
+                "the file."
             )
         self.context()
 
     def settings(self, router: bool, local_robot: str = "") -> dict[str, Any]:
-        """Return the Zenoh settings, by path, of a router or a client with these keys.
+        """Return the Zenoh settings of a router or a client, with the path of each as key.
 
         Args:
             router: True for a router, whose settings include the roles in `access.yaml`.
-            local_robot: Robot whose child processes connect over a Unix socket; empty: none.
+            local_robot: Name of the robot if child processes of the service connect over a Unix
+                socket; otherwise empty.
         """
         if router:
             return router_settings(self.folder, read_access(self.folder / ACCESS), local_robot)
@@ -123,7 +126,7 @@ class TlsKeys:
         """Log a warning if the certificate has expired or expires within 30 days.
 
         Args:
-            consequence: What happens after that, a sentence.
+            consequence: Sentence for the log: what happens after the certificate has expired.
         """
         if when := expiry_warning(self.valid_until_s()):
             log.warning(
@@ -143,7 +146,8 @@ class TlsKeys:
             context.load_verify_locations(self.folder / CA)
         except ssl.SSLError as error:
             raise ConfigError(
-                f"{self.folder / CA} contains no certificate. Copy it again."
+                f"{self.folder / CA} contains no certificate. Copy the file again from the folder "
+                "that `ldo keys` created."
             ) from error
         try:
             context.load_cert_chain(self.folder / CERTIFICATE, self.folder / KEY)
@@ -167,7 +171,8 @@ class TlsKeys:
     def server_valid_until_s(self, host: str, port: int) -> float | None:
         """Return the end of the validity of a server's certificate, Unix time in seconds.
 
-        The result is None if the server is absent, or if it and these keys reject each other.
+        The result is None if the server is absent, if the server rejects these keys, or if the
+        certificate of the server is rejected.
         """
         try:
             return self._handshake(host, port)

@@ -44,12 +44,14 @@ class MessageReader:
 
     @contextmanager
     def poller(self, key: str, kind: type[M], keep: int) -> Iterator[Callable[[], list[M]]]:
-        """Yield a function that returns the messages since its last call, without waiting.
+        """Open a context with a function that returns the messages received since its last call.
+
+        The function returns immediately, even if there are no messages.
 
         Args:
-            key: Key of the messages, relative to the robot; it may contain `*`.
-            kind: Type of the messages; malformed ones are logged and skipped.
-            keep: Number of buffered messages; older ones are dropped.
+            key: Key of the messages, relative to the key prefix of the robot; it may contain `*`.
+            kind: Type of the messages; malformed messages are logged and skipped.
+            keep: Maximum number of buffered messages; the oldest ones are dropped.
         """
         with self._subscriber(key, keep) as subscriber:
 
@@ -59,7 +61,10 @@ class MessageReader:
             yield inbox
 
     def last_values(self, topic: Topic, timeout_s: float) -> list[Message]:
-        """Return all parts of the last value of a state topic; empty if there is no value."""
+        """Return all messages of the last value of a state topic; empty if there is no value.
+
+        A state topic answers queries with its last value, which may consist of several messages.
+        """
         replies = self._session.get(
             self._network.expression(topic.name),
             timeout=timeout_s,

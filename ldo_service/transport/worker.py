@@ -44,7 +44,10 @@ class Worker:
         Worker._all.add(self)
 
     def submit(self, job: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> "Future[R]":
-        """Queue a job, and return its future. After `close`, the future is cancelled instead."""
+        """Queue a job, and return its future.
+
+        After `close`, the job is not queued, and its future is cancelled.
+        """
         future: Future[R] = Future()
         with self._lock:
             if self._closed:
@@ -65,7 +68,7 @@ class Worker:
                 self._jobs.put(None)
 
     def join(self, timeout_s: float) -> None:
-        """Wait at most `timeout_s` for the end of the thread, after `close`.
+        """Wait at most `timeout_s` for the end of the thread; call `close` first.
 
         Without this wait, the end of the interpreter may kill the thread inside a library. Some
         libraries then abort the process.

@@ -48,7 +48,8 @@ def open_session(network: Endpoint, router: bool = False) -> zenoh.Session:
 
     Raises:
         ConfigError: The endpoint is malformed.
-        UnavailableError: Its port is in use, no service replies on it, or the keys are rejected.
+        UnavailableError: The port is in use, no service replies on the endpoint, or the keys are
+            rejected.
     """
     try:
         config = _session_config(network, router)
@@ -187,7 +188,7 @@ class ZenohTransport:
         self._declared.append(liveliness.declare_subscriber(expression, handler, history=True))
 
     def serve_queries(self, key: str, last_values: LastValues) -> None:
-        """Reply to queries on a key with the parts that `last_values` returns."""
+        """Reply to each query on a key with the messages that `last_values` returns."""
         expression = self._network.expression(key)
 
         def reply(query: zenoh.Query) -> None:
@@ -215,7 +216,8 @@ class ZenohTransport:
 
         Args:
             key: Key of the queries.
-            respond: Coroutine function from the payload of a query to the payload of the reply.
+            respond: Coroutine function that takes the payload of a query and returns the payload of
+                the reply.
         """
         expression = self._network.expression(key)
 
@@ -245,7 +247,7 @@ class ZenohTransport:
         self._declared.append(self._session.declare_queryable(expression, handler))
 
     def close(self) -> None:
-        """End all subscriptions, queries and tokens.
+        """End all subscriptions, query handlers and liveliness tokens.
 
         All publishers together have `LEAVE_WITHIN_S` to send pending messages.
         """
@@ -278,11 +280,17 @@ class ZenohPublisher:
         self._posted: tuple[bytes, bytes] | None = None
 
     def send(self, header: bytes, body: bytes) -> Awaitable[None]:
-        """Send a message; the returned awaitable is done when it was sent or dropped."""
+        """Send a message.
+
+        The returned awaitable is done when the message has been sent or dropped.
+        """
         return self._thread.run(self._put, header, body)
 
     def post(self, header: bytes, body: bytes) -> None:
-        """Send a message without waiting; it replaces the last posted message if still unsent."""
+        """Send a message without waiting.
+
+        The message replaces an earlier posted message that was not sent yet.
+        """
         with self._lock:
             is_under_way, self._posted = self._posted is not None, (header, body)
         if not is_under_way:
@@ -307,7 +315,7 @@ class ZenohPublisher:
         self._thread.close()
 
     def join(self, timeout_s: float) -> None:
-        """Wait at most `timeout_s` for the end of the thread, after `close`."""
+        """Wait at most `timeout_s` for the end of the thread; call `close` first."""
         self._thread.join(timeout_s)
 
     def _undeclare(self) -> None:

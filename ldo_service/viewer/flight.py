@@ -1,4 +1,4 @@
-"""Camera views of objects, and smooth motion of the browser's camera to them."""
+"""Views of objects, and smooth motion of the viewer's virtual camera to these views."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -17,11 +17,11 @@ HALF_VIEW_RAD = (
 
 @dataclass(frozen=True, slots=True)
 class CameraView:
-    """Position and direction of the browser's camera.
+    """Position and viewing direction of the virtual camera in a browser.
 
     Attributes:
         position: Position of the camera in the map frame, [3], meters.
-        look_at: Point in the center of the picture, [3], meters.
+        look_at: Point of the map frame in the center of the picture, [3], meters.
     """
 
     position: np.ndarray
@@ -29,15 +29,15 @@ class CameraView:
 
 
 def view_of(one: MapObject, keyframes: Mapping[int, np.ndarray], eye: np.ndarray) -> CameraView:
-    """Return a close view of a whole object, from a direction where nothing hides the object.
+    """Return a close view of a whole object, if possible from a direction that is not occluded.
 
-    The view is from the direction of the keyframe that shows the object best, among the keyframes
-    with a known pose. If there is no such keyframe, the view is from the direction of `eye`.
+    The view lies on the line from the object to the keyframe that shows the object best. Keyframes
+    without a known pose are skipped. If no keyframe is left, `eye` replaces the keyframe.
 
     Args:
         one: The object.
         keyframes: T_map_camera of each keyframe, [4, 4], by id.
-        eye: Current position of the browser's camera, [3], meters.
+        eye: Current position of the browser's virtual camera in the map frame, [3], meters.
     """
     center = np.array(one.T_map_object.translation)
     known = [view.keyframe for view in one.views if view.keyframe in keyframes]
@@ -55,23 +55,23 @@ def overview(T_map_camera: np.ndarray, back_m: float = 0.6, ahead_m: float = 2.0
 
     Args:
         T_map_camera: Pose of the camera, [4, 4].
-        back_m: Distance of the view behind the camera.
-        ahead_m: Distance of the point in the center of the picture.
+        back_m: Distance of the view behind the camera, meters.
+        ahead_m: Distance from the camera to the point in the center of the picture, meters.
     """
     position, ahead = T_map_camera[:3, 3], T_map_camera[:3, 2]
     return CameraView(position - back_m * ahead, position + ahead_m * ahead)
 
 
 def estimate_up(keyframes: Mapping[int, np.ndarray]) -> np.ndarray:
-    """Return the up direction of the map for a level horizon, [3].
+    """Estimate the up direction, a unit vector [3] in the map frame, for a level horizon.
 
     A handheld camera is tilted more than it is rolled. Let x (right) and y (down) be the axes of
-    each keyframe's camera. Up is the unit vector u that minimizes
+    each keyframe's camera. The up direction is the unit vector u that minimizes
 
         mean (x . u)^2 + TILT (1 - mean (y . u)^2)
 
-    and points opposite to y on average. Without keyframes, up is -y of the map, which is right if
-    the camera was level at the start.
+    over the keyframes, with the sign that makes it opposite to the mean y. If there are no
+    keyframes, the result is -y of the map. This is correct if the camera was level at the start.
 
     Args:
         keyframes: T_map_camera of each keyframe, [4, 4], by id.

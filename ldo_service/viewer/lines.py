@@ -44,7 +44,7 @@ class Lines:
 
     @classmethod
     def of(cls, points: np.ndarray, color: Color) -> "Lines":
-        """Return segments of one color from their ends, [S, 2, 3] meters."""
+        """Return segments of one color, given both ends of each segment, [S, 2, 3] meters."""
         points = np.asarray(points, np.float32).reshape(-1, 2, 3)
         return cls(points, np.broadcast_to(np.array(color, np.uint8), points.shape))
 
@@ -61,8 +61,9 @@ class Lines:
 def path_lines(positions: np.ndarray, color: Color) -> Lines:
     """Return the path through camera positions, with gaps where the position jumps.
 
-    A jump is a step that is much longer than most steps. The limit is relative to the median step,
-    since a long path is drawn with only some of its positions.
+    A step between two positions is a jump if it has at least the length JUMP_M, and at least JUMPS
+    times the median length. The second limit is relative, because a long path is drawn with only
+    some of its positions, and its steps are then longer.
 
     Args:
         positions: Positions of the camera, [K, 3], meters; NaN where unknown.
@@ -103,8 +104,8 @@ def detection_lines(
 
     Args:
         keyframes: T_map_camera of each keyframe, [4, 4], by id.
-        camera: Intrinsics of the keyframes; None draws nothing.
-        detections: Detections of each keyframe, by id.
+        camera: Intrinsics of the keyframes. If None, the result has no lines.
+        detections: Detections of each keyframe, by keyframe id.
     """
     shown = [
         (T, detection)
@@ -124,7 +125,7 @@ def detection_lines(
 
 
 def box_lines(objects: Iterable[MapObject], color: Color | None = None) -> Lines:
-    """Return the edges of the box of each object, by default in the color of its name."""
+    """Return the edges of the box of each object; `color_of` its name is the default color."""
     return Lines.together(
         Lines.of(
             se3.transform(pose_from_message(one.T_map_object), EDGES * one.size),

@@ -305,6 +305,6 @@ class LiveSource:
 
 @contextmanager
 def live(service: Client, config: ViewerConfig) -> Iterator[LiveSource]:
-    """Open a context with the source of a service's scene, subscribed to all needed topics."""
+    """Open a context with a `LiveSource` that is subscribed to the topics of a service."""
     with ExitStack() as stack:
         yield LiveSource(service, config, stack)

@@ -61,12 +61,12 @@ class LivePath:
         return len(self._online)
 
     def add(self, pose: TrackedPose, T_map_camera: np.ndarray) -> None:
-        """Add a frame that is not LOST, with its position as published and as corrected later.
+        """Add the camera position of a frame whose tracking status is not LOST.
 
         Args:
             pose: Tracked pose of the frame.
-            T_map_camera: Pose of the camera as published, [4, 4]. In submaps other than 0, its
-                position is stored as unknown, because it is not in the frame of the map.
+            T_map_camera: Published pose of the camera, [4, 4]. If the frame is in a submap other
+                than 0, this pose is not in the map frame. Its position is then stored as unknown.
         """
         self._heard += 1
         if self._heard % self._every:
@@ -84,9 +84,10 @@ class LivePath:
         return np.array(self._online).reshape(-1, 3)
 
     def final(self, T_map_keyframe: dict[int, np.ndarray]) -> np.ndarray:
-        """Return the corrected positions of all frames with a known reference keyframe, [K, 3].
+        """Return the corrected positions of all frames with a known reference keyframe.
 
-        A position is T_map_reference p_reference. The positions are in order of time.
+        The camera position in the frame of the reference keyframe is transformed to the map frame.
+        The result has the shape [K, 3], in meters, in order of time.
 
         Args:
             T_map_keyframe: Pose of each keyframe, [4, 4], by id.

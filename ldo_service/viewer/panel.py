@@ -23,7 +23,7 @@ def escaped(text: str) -> str:
 
 # --- of a run -------------------------------------------------------------------------------------
 def of_summary(summary: Mapping[str, Any]) -> str:
-    """Return as text the values of summary.json that are present and valid."""
+    """Format the values of summary.json as Markdown; missing and invalid values are omitted."""
     counts = [
         f"{summary[name]:,} {says}"
         for name, says in (
@@ -75,7 +75,7 @@ class Rate:
 
     @property
     def hz(self) -> float:
-        """Rate of the counter per second; 0 until two values were added."""
+        """Increase of the counter per second; 0 until two values have been added."""
         (first_s, first), (last_s, last) = self._counts[0], self._counts[-1]
         return (last - first) / (last_s - first_s) if last_s > first_s else 0.0
 
@@ -91,7 +91,7 @@ class HeartbeatRecord:
 
 @dataclass(slots=True)
 class HeardPose:
-    """Last pose, and the time when it was received."""
+    """Last received pose of the camera, and the time of its receipt."""
 
     pose: TrackedPose
     at_s: float  # Time of receipt on the clock of the scene, monotonic seconds.
@@ -116,7 +116,10 @@ def of_pose(heard: HeardPose | None, poses: Rate, now_s: float) -> str:
 
 
 def of_health(heard: Iterable[HeartbeatRecord], now_s: float) -> str:
-    """Return a table with state, step rate, step time, drops and memory of each actor.
+    """Return a table with one row for each actor, in Markdown.
+
+    The columns are state, handled messages per second, handling time in ms (median and 95th
+    percentile), dropped messages, and memory in MB.
 
     Args:
         heard: The last heartbeat of each actor.

@@ -23,7 +23,7 @@ Signature = tuple[int, int]  # Time of the last change, ns, and size, bytes.
 
 
 class RunFolder:
-    """Source of the scene of a run folder, which is checked at every `update`.
+    """Source of the scene of a run folder; each `update` checks the folder for changes.
 
     A file that cannot be read is reported in the panel, and read again when it changes.
     """
@@ -36,7 +36,8 @@ class RunFolder:
         """
         if not folder.is_dir():
             raise DataError(
-                f"{folder} is not a folder. Give the folder of an `ldo run`, or `live`."
+                f"{folder} is not a folder. Give the --out folder of a run, or `live` for a "
+                "running service."
             )
         self._folder, self._config = folder, config
         self._begin()
@@ -45,7 +46,7 @@ class RunFolder:
         if not any(_signature(folder / name) for name in ("config.yaml", *PARTS)):
             raise DataError(
                 f"{folder} holds nothing that `ldo run` writes, such as map.ply or trajectory.txt. "
-                "Give the folder that was the --out of a run."
+                "Give the --out folder of a run."
             )
 
     def _begin(self) -> None:

@@ -1,4 +1,4 @@
-"""Scene of map and camera, and conversion of its Gaussians for the browser.
+"""Scene that the viewer draws, and conversion of its Gaussians for the browser.
 
 Conventions: `ldo_service.geometry`.
 """
@@ -72,7 +72,7 @@ class Source(Protocol):
 
 
 def detections_of(objects: MapObjects) -> dict[int, tuple[ObjectBox, ...]]:
-    """Return the detections of all objects in their views, by keyframe id."""
+    """Return the detections of all objects, grouped by the id of the keyframe."""
     detections: dict[int, tuple[ObjectBox, ...]] = {}
     for one in objects.objects:
         for view in one.views:
@@ -93,7 +93,7 @@ def thinned(values: np.ndarray, most: int) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class Splats:
-    """Gaussians in the format of a browser.
+    """Gaussians in the format in which viser draws them.
 
     Attributes:
         centers: Centers in the map frame, [N, 3] float32, meters.
@@ -109,9 +109,10 @@ class Splats:
 
 
 def splats_of(rows: np.ndarray) -> Splats:
-    """Return Gaussians in the format of a browser.
+    """Convert Gaussians to the format in which viser draws them.
 
-    The covariance is R S S R^T, with the rotation R of the quaternion and the scales S.
+    The covariance is R S S R^T, with the rotation matrix R of the quaternion and the diagonal
+    matrix S of the scales.
 
     Args:
         rows: Gaussians, [N, 16], see `gaussians.rows`.

@@ -9,7 +9,7 @@ from ldo_service.transport.endpoint import LOOPBACK
 
 @dataclass(frozen=True, slots=True)
 class ViewerConfig:
-    """Limits of `ldo view`, which protect browser and network from a large map."""
+    """Address and limits of `ldo view`; the limits protect browser and network from large maps."""
 
     address: str = LOOPBACK  # The window needs no keys: anyone who reaches it can see the map.
     port: int = 8080  # If this port is in use, the next free one is used. 0 uses any free port.
@@ -32,13 +32,14 @@ class ViewerConfig:
         times_s = (self.update_s, self.lines_s, self.gaussians_s)
         if min(counts) < 1 or min(times_s) <= 0 or not 0 <= self.port <= 65535:
             raise ConfigError(
-                f"viewer: the counts {counts} of Gaussians, poses, keyframes and objects must be "
-                f"at least 1, intervals {times_s} positive, and port {self.port} within 0..65535."
+                f"viewer: the maximum numbers {counts} of Gaussians, poses, keyframes and objects "
+                f"must be at least 1. The intervals {times_s} s must be positive. The port "
+                f"{self.port} must be within 0..65535."
             )
 
 
 def viewer_config(settings: ViewerSettings) -> ViewerConfig:
-    """Return the parameters of the viewer, with the values of its settings."""
+    """Convert the settings of the viewer to its parameters; the others keep their defaults."""
     return ViewerConfig(
         address=settings.address,
         port=settings.port,

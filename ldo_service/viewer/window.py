@@ -56,7 +56,7 @@ class Server(viser.ViserServer):
 
 
 class Window:
-    """Window in the browser, which `open_window` makes and `show` updates."""
+    """Window of the viewer in the browser; `open_window` opens it, and `show` updates it."""
 
     def __init__(
         self,
@@ -273,7 +273,7 @@ class Window:
             _set_view(client, view)
 
     def eyes(self) -> list[CameraView]:
-        """Return the view of each browser."""
+        """Return the current view of the virtual camera in each connected browser."""
         cameras = (client.camera for client in self._server.get_clients().values())
         return [CameraView(camera.position, camera.look_at) for camera in cameras]
 

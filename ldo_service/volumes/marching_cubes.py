@@ -43,7 +43,7 @@ class Surface:
     """Triangles of a surface, in grid coordinates.
 
     Attributes:
-        points: [V, 3].
+        points: Corners of the triangles, [V, 3].
         attributes: Interpolated attributes of the points, [V, C].
         triangles: Indices of points, [M, 3]; counterclockwise when seen from the side where the
             function is positive.
@@ -106,7 +106,8 @@ def pack(lattice: np.ndarray) -> np.ndarray:
     """Pack integer triples [..., 3] into int64 below 2^60; lexicographic order is preserved.
 
     Raises:
-        ConfigError: A coordinate is 2^19 or more from the origin: 10 km with voxels of 2 cm.
+        ConfigError: The absolute value of a coordinate is 2^19 or more. With voxels of 2 cm, this
+            is 10 km from the origin.
     """
     if len(lattice) and max(lattice.max(), -lattice.min()) >= 1 << 19:
         raise ConfigError(
@@ -121,7 +122,7 @@ class Mesh:
     """Triangle mesh in the map frame.
 
     Attributes:
-        vertices_m: [V, 3] float32.
+        vertices_m: Positions of the vertices, [V, 3] float32, meters.
         colors: RGB of the vertices, [V, 3] uint8.
         triangles: Indices of vertices, [M, 3] int32; counterclockwise when seen from free space.
     """

@@ -58,9 +58,9 @@ class OccupancyGrid:
     """Occupancy grid with the axes of the map.
 
     Attributes:
-        origin_m: Lower corner of voxel (0, 0, 0) in the map, [3].
-        voxel_m: Side of a voxel.
-        states: [X, Y, Z] uint8: 0 unknown, 1 free, 2 occupied.
+        origin_m: Corner of voxel (0, 0, 0) with the smallest coordinates in the map, [3], meters.
+        voxel_m: Side length of a voxel, meters.
+        states: State of each voxel, [X, Y, Z] uint8: 0 unknown, 1 free, 2 occupied.
     """
 
     origin_m: np.ndarray
@@ -252,13 +252,13 @@ class FloorPlan:
     """Floor plan: the voxels of an occupancy grid in a range of heights, seen from above.
 
     Attributes:
-        states: [X, Y] uint8: 0 unknown, 1 free, 2 occupied.
-        origin_m: Lower corner of cell (0, 0) along the map axes `x` and `y`, meters.
-        cell_m: Side of a cell.
+        states: State of each cell, [X, Y] uint8: 0 unknown, 1 free, 2 occupied.
+        origin_m: Smallest coordinates in cell (0, 0) along the map axes `x` and `y`, meters.
+        cell_m: Side length of a cell, meters.
         x: Axis of the map along the first dimension.
         y: Axis of the map along the second dimension.
-        up: Axis of the map that is up, with its sign.
-        heights_m: Range of heights along `up` that the plan covers.
+        up: Axis of the map that points up, with its sign, such as "-y".
+        heights_m: Range of heights along `up` that the plan covers, meters from the map origin.
     """
 
     states: np.ndarray
@@ -281,10 +281,10 @@ def floor_plan(
 
     Args:
         grid: The occupancy grid.
-        up: Axis of the map that is up, a key of `UP`. The map has the axes of the first camera,
-            and -y is up if that camera was level.
-        heights_m: Range of heights along `up`, relative to the origin of the map, which is the
-            position of the first camera.
+        up: Axis of the map that points up, a key of `UP`. The map has the axes of the camera at
+            the first frame. If the camera was level there, "-y" points up.
+        heights_m: Lowest and highest height along `up`, meters from the origin of the map. The
+            origin is the position of the camera at the first frame.
 
     Raises:
         ConfigError: `up` is not an axis, or the range contains no voxel.
@@ -314,7 +314,7 @@ def floor_plan(
 
 
 def write_floor_plan(path: Path, plan: FloorPlan) -> None:
-    """Write the YAML file `path` and the image (.pgm) next to it, with y pointing up."""
+    """Write a YAML file to `path` and the .pgm image next to it; y points up in the image."""
     gray = np.array([GRAY[state] for state in (UNKNOWN, FREE, OCCUPIED)], np.uint8)
     picture = np.ascontiguousarray(gray[plan.states].T[::-1])
     path.with_suffix(".pgm").write_bytes(cv2.imencode(".pgm", picture)[1].tobytes())

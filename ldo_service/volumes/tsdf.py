@@ -69,7 +69,7 @@ def fuse(
 
     Args:
         rows: Gaussians, [N, 16].
-        viewpoints: The viewpoints.
+        viewpoints: Cameras with their poses, from which the map is rendered.
         config: Settings.
         threads: Threads of the renderer.
         advance: Called with the number of finished viewpoints, to show progress.
@@ -120,8 +120,8 @@ class Tsdf:
         The weight is the inverse square of the depth, like the density of pixels on the surface.
 
         Args:
-            depth_m: [H, W]; 0 where unknown.
-            color: [H, W, 3], 0..1.
+            depth_m: Depth image, [H, W], meters; 0 where unknown.
+            color: Color image, [H, W, 3], 0..1.
             viewpoint: Camera and pose of the image.
 
         Raises:

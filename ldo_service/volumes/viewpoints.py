@@ -12,14 +12,14 @@ NEAR_M = 0.01  # Points nearer than this, or behind the camera, project to no pi
 
 @dataclass(frozen=True, slots=True)
 class Lookup:
-    """Values of a depth image at the pixels into which some points project.
+    """Values of a depth image at the pixels into which points [..., 3] project.
 
     Attributes:
-        z_m: Depth of the points themselves in the camera frame, [...].
-        seen_m: Value of the depth image at the pixel nearest to each point, [...]; 0 outside the
+        z_m: Depth of each point itself in the camera frame, [...], meters.
+        seen_m: Value of the depth image at the pixel of each point, [...], meters; 0 outside the
             image and where the depth is unknown.
-        row: Row of this pixel, [...]; 0 outside the image.
-        column: Column of this pixel, [...]; 0 outside the image.
+        row: Row of the pixel of each point, [...]; 0 outside the image.
+        column: Column of the pixel of each point, [...]; 0 outside the image.
     """
 
     z_m: np.ndarray
@@ -36,11 +36,11 @@ class Viewpoint:
     T_map_camera: np.ndarray
 
     def render(self, rows: np.ndarray, threads: int = 1) -> Rendering:
-        """Render Gaussians, rows [N, 16], at this viewpoint."""
+        """Render Gaussians, [N, 16], from this viewpoint."""
         return render(rows, self.camera, se3.inverse(self.T_map_camera), threads=threads)
 
     def look_up(self, p_camera: np.ndarray, depth_m: np.ndarray) -> Lookup:
-        """Read a depth image [H, W] of this viewpoint at points [..., 3] in the camera frame."""
+        """Read a depth image [H, W] at the pixels of points [..., 3] in the camera frame."""
         z_m = p_camera[..., 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             u, v = np.moveaxis(np.rint(self.camera.project(p_camera)), -1, 0)

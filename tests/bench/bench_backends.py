@@ -213,7 +213,7 @@ def connect_patiently(stack: ExitStack, network: Endpoint) -> Client:
             return stack.enter_context(connect(network.robot, network.endpoint))
         except ConfigError:  # The router of the service is not open yet.
             time.sleep(0.5)
-    raise SystemExit(f"no service at {network.endpoint}")
+    raise SystemExit(f"the service at {network.endpoint} did not answer")
 
 
 def wait_for_actors(monitor: Monitor) -> None:
@@ -222,7 +222,9 @@ def wait_for_actors(monitor: Monitor) -> None:
         if {"mapper", *SLOW_BACKENDS["all"]} <= monitor.health.keys():
             return
         time.sleep(0.5)
-    raise SystemExit(f"only these actors have started: {sorted(monitor.health)}")
+    raise SystemExit(
+        f"mapper or back ends have not started; actors that started: {sorted(monitor.health)}"
+    )
 
 
 def stream(client: Client, sequence: Sequence, hz: float, stop: threading.Event) -> None:

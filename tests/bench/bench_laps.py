@@ -194,7 +194,8 @@ def true_poses(sequence: Sequence) -> np.ndarray:
     truth = sequence.truth()
     if truth is None or len(truth) != len(sequence):
         raise SystemExit(
-            f"{sequence.name} has no true pose for each frame; run without --true-poses."
+            f"{sequence.name} does not have a ground-truth pose for every frame; run without "
+            "--true-poses."
         )
     return truth.T_world_camera
 

@@ -77,7 +77,7 @@ def _agrees(seen: Rendering, frame: RgbdFrame) -> np.ndarray:
 def row(sequence: Sequence, frames: int, model: str) -> str:
     truth = sequence.truth()
     if truth is None:
-        raise SystemExit(f"{sequence.name} has no true trajectory to evaluate against.")
+        raise SystemExit(f"{sequence.name} has no ground truth; choose another sequence.")
     odometry, poses, trusted = MapViewOdometry(model), [], 0
     for index in range(frames):
         result = odometry.process(sequence[index])

@@ -47,7 +47,7 @@ class Worker:
         stdin.flush()
         line = stdout.readline()
         if not line:
-            raise SystemExit(f"the worker has ended with the status {self._process.wait()}.")
+            raise SystemExit(f"the worker process ended with status {self._process.wait()}.")
         answer: dict[str, Any] = json.loads(line)
         return answer
 

@@ -134,7 +134,7 @@ def test_invalid_camera_info_is_rejected(info, expected: str) -> None:
         ),
         (
             image("rgb8", COLOR, step=23),
-            "rows of at least 24 bytes, but has 144 bytes in rows of 23",
+            "rows of at least 24 bytes, but has 144 bytes with 23 per row",
         ),
         (image("rgb8", COLOR, height=7), "has 144 bytes"),
         (image("rgb8", COLOR, data=np.zeros(3, np.uint8)), "has 3 bytes"),
@@ -234,7 +234,7 @@ def test_depth_of_another_frame_is_rejected_unless_declared_registered() -> None
 def test_sizes_that_differ_are_rejected() -> None:
     with pytest.raises(FrameError, match="differ in size"):
         frame_of(depth_of(pixels=DEPTH_MM[:4]))
-    with pytest.raises(FrameError, match="8x6 pixels and its camera info 8x5"):
+    with pytest.raises(FrameError, match="8x6 pixels, but its camera info states 8x5"):
         frame_of(depth_of(), read_camera(cdr(camera_info(height=5)), False))
 
 

@@ -80,7 +80,10 @@ def changed(camera: int, key: str, value: object) -> Any:
     [
         (None, r"has no attachment calibration\.json; its video streams are: COLOR, DEPTH"),
         ({}, "does not have the expected values .KeyError: 'CalibrationInformation'"),
-        ({"CalibrationInformation": {"Cameras": 3}}, "`Cameras` must be a list"),
+        (
+            {"CalibrationInformation": {"Cameras": 3}},
+            r"`CalibrationInformation\.Cameras` must be a list",
+        ),
         (changed(1, "Location", "x"), "KeyError: 'CALIBRATION_CameraLocationPV0'"),
         (
             changed(0, "Intrinsics", {"ModelParameters": [1]}),

@@ -114,7 +114,7 @@ def _cut(path: Path) -> None:
         (lambda path: change_archive(path, {"metadata": b"[1]"}), "`metadata` contains a list"),
         (
             lambda path: change_archive(path, {f"rgbd/{k}.depth": None for k in range(11)}),
-            r"no rgbd/N\.jpg with an rgbd/N\.depth",
+            r"no pair of files rgbd/N",
         ),
     ],
 )
@@ -136,7 +136,7 @@ def test_damaged_archive_is_named(path: Path, damage: Callable[[Path], None], me
         ({"dh": 1e9}, r"dh of the metadata is 1e\+09, expected a whole number of pixels"),
         ({"h": 64}, r"the images have 64x48 pixels, but the intrinsics are for 64x64"),
         ({"frameTimestamps": [0.0, 0.1, 0.1]}, "the metadata need frameTimestamps"),
-        ({"frameTimestamps": None, "fps": 0}, "fps, a positive number"),
+        ({"frameTimestamps": None, "fps": 0}, "fps must be a positive number"),
         ({"frameTimestamps": "abcdefghijkl"}, "the metadata need frameTimestamps"),
     ],
 )

@@ -87,7 +87,7 @@ def test_damaged_first_image_does_not_hide_the_size_of_the_others(scannet_folder
 def test_color_of_another_size_than_the_first_is_a_bad_frame(scannet_folder: Writer) -> None:
     folder = scannet_folder([0, 1])
     cv2.imwrite(str(folder / "color/1.jpg"), np.zeros((16, 24, 3), np.uint8))
-    with pytest.raises(FrameError, match="color is 24x16 pixels and its camera 48x32"):
+    with pytest.raises(FrameError, match="color is 24x16 pixels, but its intrinsics are for 48x32"):
         open_sequence(str(folder)).read(1)
 
 

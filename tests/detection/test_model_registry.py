@@ -102,7 +102,7 @@ def test_damaged_model_raises_and_is_removable(models: Models, file: Path, damag
 
 def test_unknown_name_raises_with_list_of_models(models: Models, file: Path) -> None:
     models.add("one", file, CONFIG)
-    with pytest.raises(ConfigError, match="has the models: one"):
+    with pytest.raises(ConfigError, match="Registered models: one"):
         open_detector("two", CONFIG)
     with pytest.raises(ConfigError, match="registered: one"):
         models.remove("two")
@@ -195,7 +195,7 @@ def test_detector_and_pair_are_not_interchangeable(
         open_detector("colors", CONFIG)
     with pytest.raises(ModelError, match=r"set it as detector\.model"):
         open_labeller("squares", ENCODERS)
-    with pytest.raises(ConfigError, match="has the models: colors, squares"):
+    with pytest.raises(ConfigError, match="Registered models: colors, squares"):
         open_labeller("other", ENCODERS)
 
 

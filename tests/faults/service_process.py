@@ -167,9 +167,11 @@ class ServiceProcess:
             if true():
                 return time.monotonic() - started_s
             if self.process.poll() is not None:
-                raise NotRecovered(f"the service ended with {self.process.returncode} ({what})")
+                raise NotRecovered(
+                    f"the service ended with status {self.process.returncode} before: {what}"
+                )
             if time.monotonic() - started_s > timeout_s:
-                raise NotRecovered(f"not within {timeout_s:g} s: {what}")
+                raise NotRecovered(f"did not happen within {timeout_s:g} s: {what}")
             time.sleep(0.02)
 
     # --- content of the map -----------------------------------------------------------------------

@@ -285,7 +285,7 @@ def measure_commands(hosts: Hosts, client: Client, network: BadNetwork) -> dict[
     for reader in readers:  # Each reader has read the map once.
         assert reader.stdout
         if reader.stdout.readline() != "reading\n":
-            raise SystemExit("a reader of the map ended")
+            raise SystemExit("a process that reads the map ended before it had read the map")
     readers[1].send_signal(signal.SIGSTOP)
     took_s, refused = [], 0
     for number in range(COMMANDS):
@@ -319,7 +319,9 @@ def run(out: Path, trials: list[Trial], seed: int) -> None:
         hosts.serve(HOST, "host", "--client", *actors)
         watch = Watch(client, stack)
         if watch.wait(lambda: len(watch.health) == len(GRAPH), PATIENCE_S) < 0:
-            raise SystemExit(f"only {sorted(watch.health)} run; the logs are in {folder}")
+            raise SystemExit(
+                f"only these actors have started: {sorted(watch.health)}; the logs are in {folder}"
+            )
         processes = {name: (health.pid, health.epoch) for name, health in watch.health.items()}
         camera = CameraStream(frames(), RATE_HZ)
         for trial in trials:

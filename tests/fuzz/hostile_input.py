@@ -182,9 +182,13 @@ async def run(seed: int, is_over: Callable[[int, float], bool]) -> Outcome:
             peak = max(peak, *(waiting_mb(stage) for stage in stages))
         for task in tasks:
             if task.done():
-                raise RuntimeError(f"seed {seed}: {task.get_name()} ended after {inputs} inputs")
+                raise RuntimeError(
+                    f"seed {seed}: {task.get_name()} ended unexpectedly after {inputs} inputs"
+                )
         if peak > MAX_MB:
-            raise RuntimeError(f"seed {seed}: a mailbox holds {peak:.0f} MB")
+            raise RuntimeError(
+                f"seed {seed}: a mailbox holds {peak:.0f} MB, must hold at most {MAX_MB:.0f} MB"
+            )
     healths = [stage.health() for stage in stages]
     for task in tasks:
         task.cancel()

@@ -155,7 +155,7 @@ def test_missing_depth_registers_to_missing_depth() -> None:
 
 
 def test_depth_of_another_size_than_its_camera_is_an_error() -> None:
-    with pytest.raises(FrameError, match="depth is 63x48 pixels and its camera 64x48"):
+    with pytest.raises(FrameError, match="depth is 63x48 pixels, but its intrinsics are for 64x48"):
         register_depth(np.ones((48, 63), np.float32), CAMERA, FINER, np.eye(4))
 
 

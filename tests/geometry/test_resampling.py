@@ -49,5 +49,5 @@ def test_pixels_outside_the_color_image_are_marked() -> None:
 
 
 def test_color_of_another_size_than_its_camera_is_an_error() -> None:
-    with pytest.raises(FrameError, match="color is 64x48 pixels and its camera 130x97"):
+    with pytest.raises(FrameError, match="64x48 pixels, but its intrinsics are for 130x97"):
         resample_color(colored_by_ray(CAMERA), FINER, CAMERA)

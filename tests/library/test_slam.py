@@ -288,7 +288,7 @@ def test_settings_may_come_from_a_file_and_a_mapping(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("T", "message"),
     [
-        (None, "that is not LOST"),
+        (None, "with status OK or WEAK"),
         (np.eye(3), "shape"),
         ("x", "is a str"),
         (2 * np.eye(4), "rigid"),

@@ -31,7 +31,7 @@ class WithBadFrame(Rearranged):
 
 class NeverRead(Rearranged):
     def read(self, index: int) -> RawFrame:
-        raise AssertionError(f"frame {index} is read although the front end has it")
+        raise AssertionError(f"frame {index} is read again; the front end has read it already")
 
 
 @pytest.fixture(scope="module")
@@ -105,9 +105,9 @@ def test_other_mapper_setting_changes_the_map_and_no_online_pose(
 
 
 def test_changed_front_end_setting_is_refused(walk: Sequence, full_run: Path) -> None:
-    with pytest.raises(ConfigError, match=r"tracker\.hold_out=5 was 0 when"):
+    with pytest.raises(ConfigError, match=r"tracker\.hold_out=5 must be 0, "):
         opened(full_run, walk, "tracker.hold_out=5")
-    with pytest.raises(ConfigError, match=r"offline\.latency_frames\.detector=4 was 3"):
+    with pytest.raises(ConfigError, match=r"offline\.latency_frames\.detector=4 must be 3"):
         opened(full_run, walk, "offline.latency_frames.detector=4")
 
 

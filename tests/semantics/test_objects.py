@@ -122,7 +122,7 @@ def test_restored_objects_continue_bitwise_equal() -> None:
 
 def test_state_of_another_version_raises() -> None:
     packed = Objects().pack()
-    with pytest.raises(ValueError, match="another version of the service wrote them"):
+    with pytest.raises(ValueError, match="another version of the service wrote it"):
         Objects.unpack({**packed, "landmarks": np.zeros((1, 8), np.uint8)})
 
 

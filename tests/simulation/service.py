@@ -305,7 +305,7 @@ class Machine:
         self._failed_actors.discard(actor)
         if actor in self.failing_after_save:
             self.failing_after_save.discard(actor)
-            raise RuntimeError("injected after the save")
+            raise RuntimeError("injected failure after the save")
 
     @contextmanager
     def running(self) -> Iterator[None]:

@@ -189,7 +189,7 @@ class VirtualLoop(asyncio.BaseEventLoop):
             heapq.heappop(scheduled)._scheduled = False
         if not ready:
             if not scheduled:
-                raise RuntimeError("nothing can ever happen again in this simulation")
+                raise RuntimeError("deadlock: no callback is ready and no timer is set")
             self._now_s = max(self._now_s, scheduled[0]._when)
         while scheduled and scheduled[0]._when <= self._now_s:
             timer = heapq.heappop(scheduled)

@@ -147,12 +147,12 @@ def test_score_that_was_not_evaluated_is_none(name: str) -> None:
     [
         ({"figures": ["beauty"]}, "unknown metric beauty. Known metrics: ate_cm"),
         ({"figures": []}, "at least one"),
-        ({"variants": {"../up": []}}, "must be usable as the name of a folder"),
-        ({"sequences": {"": "x"}}, "must be usable as the name of a folder"),
+        ({"variants": {"../up": []}}, "must be usable as a folder name"),
+        ({"sequences": {"": "x"}}, "must be usable as a folder name"),
         ({"front_end": "default"}, "front_end='default' must be the first variant"),
         (
             {"front_end": "whole", "variants": {"whole": []}, "figures": ["miou", "fps"]},
-            "fps depends on the front end",
+            "fps depends on the tracker and detector",
         ),
         ({"sequnces": {}}, "is not a suite: .*sequnces"),
         ({"seeds": ["x"]}, "is not a suite: .*seeds"),

@@ -93,7 +93,7 @@ def first_frame_that_needs_a_keyframe(
         result = odometry.process(room.view(T), may_map=False)
         if result.denied_keyframe is KeyframeKind.REFERENCE:
             return result, T
-    raise AssertionError("no frame needs a keyframe")
+    raise AssertionError("no frame on the way back needs a new reference keyframe")
 
 
 # --- odometry -------------------------------------------------------------------------------------

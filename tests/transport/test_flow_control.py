@@ -153,7 +153,7 @@ async def test_restarted_expected_consumer_receives_unhandled_messages() -> None
     def hang_at_two(value: int) -> None:
         if value == 2:
             release.wait(60)
-            raise RuntimeError("this process is dead")
+            raise RuntimeError("injected failure of the consumer")
 
     async with running(collector(transport, first, hang_at_two)):
         for value in range(6):

@@ -44,7 +44,7 @@ class Labeller(Protocol):
         ...
 
     def add(self, name: str) -> None:
-        """Add a name that the labeller may choose from now on.
+        """Add a name to the list that the labeller chooses from.
 
         Raises:
             ConfigError: If the labeller cannot add this name.

@@ -114,12 +114,12 @@ def confidence(logprobs: tuple[float, ...], how: Sureness) -> float:
 
 
 def name_of(text: str, allowed: Collection[str], max_words: int) -> str | None:
-    """Return the canonical name in an answer; None if there is no single name or it is not allowed.
+    """Return the canonical name in an answer, or None if the answer is not one allowed name.
 
     Args:
         text: Answer of the model.
         allowed: Allowed canonical names; empty: any name.
-        max_words: Maximum words of a name.
+        max_words: Maximum number of words in a name.
 
     >>> name_of("A Sofa.", (), 4), name_of("sofa", ("chair",), 4), name_of("I am not sure", (), 3)
     ('couch', None, None)
@@ -218,10 +218,10 @@ class HttpLabeller:
         return tuple(self._names)
 
     def add(self, name: str) -> None:
-        """Add a name that the model may choose from now on.
+        """Add a name to the list that the model chooses from.
 
         Raises:
-            ConfigError: If it is not a valid name, or the labeller has no list of names.
+            ConfigError: If the name is invalid, or the labeller has no list of names.
         """
         if not is_name(name):
             raise ConfigError(
@@ -240,8 +240,9 @@ class HttpLabeller:
         """Return the labels of a region; see `Labeller`.
 
         A view with a rejected answer has no label. If the server fails after some views have
-        labels, these labels are used. All views together may take `patience_s`. Once the remaining
-        time is shorter than the time of the slowest view, the remaining views are omitted.
+        labels, these labels are used. All views together have the time limit
+        `HttpClientConfig.patience_s`. Once the remaining time is shorter than the slowest view
+        took, the remaining views are omitted.
         """
         views: list[list[ScoredLabel]] = []
         until_s, slowest_s = self._clock() + self.config.endpoint.patience_s, 0.0

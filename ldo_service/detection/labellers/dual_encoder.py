@@ -1,6 +1,6 @@
 """Labels by an image encoder and a text encoder with a common embedding space, as in CLIP.
 
-Radford et al., ICML 2021.
+CLIP is the network of Radford et al., ICML 2021.
 """
 
 import json
@@ -60,7 +60,7 @@ class DualEncoderConfig:
         if not self.prompts or any(not _is_prompt(prompt) for prompt in self.prompts):
             raise ConfigError(
                 f"dual_encoder.prompts={list(self.prompts)}: there must be at least one prompt, "
-                "and each must contain {} for the name once and no other braces."
+                "and each must contain {} exactly once, in place of the name, and no other braces."
             )
         are_three = len(self.mean) in (0, 3) and len(self.std) in (0, 3)
         if not are_three or min(self.std, default=1) <= 0:
@@ -170,8 +170,8 @@ class DualEncoder:
 
             P(name) = softmax(logit_scale cos(image, name)), averaged over the crops
 
-        With two names, cosines of 0.3 and 0.28 and a scale of 100, the first has
-        P = exp(30) / (exp(30) + exp(28)) = 0.881.
+        For example, two names have the cosines 0.3 and 0.28, and logit_scale is 100. Then the first
+        name has P = exp(30) / (exp(30) + exp(28)) = 0.881.
 
         Args:
             crops: Views of the region, each [h, w, 3] uint8 RGB.
@@ -187,7 +187,7 @@ class DualEncoder:
         return [scored for scored in best if scored[0] in known_names][:MAX_LABELS]
 
     def add(self, name: str) -> None:
-        """Add a name that the labeller may choose from now on.
+        """Add a name to the list that the labeller chooses from.
 
         Raises:
             ConfigError: If the name is invalid, or has no stored embedding and there is no text
@@ -276,7 +276,7 @@ class ImageEncoder:
         return self._network.metrics()
 
     def metadata_numbers(self, key: str, count: int) -> tuple[float, ...]:
-        """Return `count` numbers from an entry of the network's metadata; empty without this entry.
+        """Return the `count` numbers of a metadata entry; empty if the network has no such entry.
 
         The text of the entry is like "0.5, 0.5, 0.5" or "[0.5, 0.5, 0.5]".
 
@@ -295,8 +295,8 @@ class ImageEncoder:
         if not is_usable or (key != "mean" and min(values) <= 0):
             raise ModelError(
                 f"the network's metadata has {key}={text[:60]!r}. Expected: {count} finite "
-                "numbers, which are positive except in `mean`. Export the network again with a "
-                "valid entry."
+                "numbers; only numbers of `mean` may be 0 or negative. Export the network again "
+                "with a valid entry."
             )
         return values
 

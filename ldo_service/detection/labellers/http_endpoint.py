@@ -113,7 +113,7 @@ class HttpClient:
             until_s: Deadline, in seconds of the clock that the client was created with.
 
         Raises:
-            DeadlineExceeded: If the deadline passes before the server had `timeout_s`.
+            DeadlineExceeded: If the deadline passes before the server had `timeout_s` to respond.
             EndpointError: If the circuit breaker is open, all attempts fail or the server rejects
                 the request.
         """

@@ -204,8 +204,8 @@ class TextEmbeddings:
     def encode(self, texts: Sequence[str]) -> np.ndarray:
         """Return the embeddings of T texts, [T, D] float32.
 
-        The row of a text without an embedding is zero, so that it has a cosine of 0 with all
-        others.
+        The row of a text without an embedding is zero, so that its cosine with every other row
+        is 0.
         """
         rows = [self.find(text) for text in texts]
         (dimensions,) = {space.dimensions for space in (self.cached, self.encoder) if space}

@@ -2,10 +2,10 @@
 
 `make gpu-check` runs each kernel in the interpreter of Triton, compares it with the C++ kernels and
 with the NumPy reference implementations, and compiles it for seven architectures. The service
-uses them if `service.device` selects a GPU. Importing this package imports no Triton; importing its
-modules with kernels does.
+uses them if `service.device` selects a GPU. Importing this package does not import Triton, but
+importing a module with kernels does.
 
-- `arithmetic`: exponentials and logarithms of IEEE operations.
+- `arithmetic`: exponentials and logarithms, computed with IEEE operations alone.
 - `projection`, `blending`: rendering of the image planes that the loss needs.
 - `loss`, `block_means`: image loss with its derivatives, and the block means for the exposure.
 - `projection_gradient`: derivatives with respect to the Gaussians, and a step of Adam.

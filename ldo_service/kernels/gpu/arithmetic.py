@@ -1,4 +1,4 @@
-"""Arithmetic with the same bits in the interpreter of Triton and on each GPU.
+"""Arithmetic with bitwise equal results in the interpreter of Triton and on each GPU.
 
 All kernels use only sums, products, correctly rounded divisions and roots, comparisons and integer
 operations. `PINNED` stops the compiler from fusing products with sums. Approximate instructions
@@ -30,8 +30,9 @@ LN_2 = tl.constexpr(0.6931471805599453)
 def exp2(x):
     """Return 2^x for x in [-126, 126], with a relative error below 2.5e-7.
 
-    Adding 1.5 * 2^23 rounds x to an integer in the low bits. A polynomial approximates the power of
-    the remaining fraction in [-1/2, 1/2]. `kernels/simd.hpp` has the same operations.
+    Adding 1.5 * 2^23 to x rounds x to an integer, which the low bits of the sum contain. A
+    polynomial approximates 2^f for the remaining fraction f in [-1/2, 1/2]. `kernels/simd.hpp`
+    contains the same operations.
     """
     shifted = x + 12582912.0
     f = x - (shifted - 12582912.0)
@@ -46,10 +47,10 @@ def exp2(x):
 
 @triton.jit
 def log2(x):
-    """Return log2 of a normal x > 0, with an absolute error below 1e-6.
+    """Return log2 of a normal float32 x > 0, with an absolute error below 1e-6.
 
-    The result is the exponent plus log2 of the mantissa m in [sqrt(1/2), sqrt(2)). A polynomial
-    approximates the latter, as ln m = 2 atanh(s) with s = (m - 1) / (m + 1).
+    The result is the exponent of x plus log2(m) of its mantissa m in [sqrt(1/2), sqrt(2)). A
+    polynomial in s = (m - 1) / (m + 1) approximates log2(m), because ln(m) = 2 atanh(s).
     """
     bits = x.to(tl.int32, bitcast=True)
     e = (bits - 0x3F3504F3) >> 23

@@ -16,7 +16,7 @@ MAX_PAIRS = 2**31 - 1  # The kernels count pairs of a Gaussian and a tile in int
 
 
 class Arrays(Protocol):
-    """Operations on arrays of one device. `Any` is an array of this device."""
+    """Operations on arrays of one device. The type `Any` stands for an array on this device."""
 
     def upload(self, values: np.ndarray) -> Any:
         """Return a copy of host values on the device."""
@@ -26,7 +26,7 @@ class Arrays(Protocol):
         ...
 
     def empty(self, shape: tuple[int, ...], dtype: type) -> Any:
-        """Return an array with undefined values, which a kernel writes before anything reads it."""
+        """Return an uninitialized array; a kernel must write it before anything reads it."""
 
     def zeros(self, shape: tuple[int, ...], dtype: type) -> Any:
         """Return an array of zeros."""
@@ -44,7 +44,7 @@ class Arrays(Protocol):
         """Replace the rows of an array at the indices `places`, in place."""
 
     def offsets(self, counts: Any) -> tuple[Any, int]:
-        """Return the sums [M] int32 of all counts before each one, and the sum of all counts.
+        """Return the exclusive prefix sums [M] int32 of the counts, and the sum of all counts.
 
         Raises:
             ConfigError: The sum of all counts does not fit into int32.
@@ -52,21 +52,21 @@ class Arrays(Protocol):
         ...
 
     def repeat(self, values: Any, counts: Any, total: int) -> Any:
-        """Return each value as often as its count says; `total` is the sum of the counts."""
+        """Repeat each value as often as its count says; `total` is the sum of the counts."""
 
     def starts(self, ascending: Any, n: int) -> Any:
-        """Return the index of the first value >= k in an ascending array for k = 0 .. n, int32."""
+        """Return for k = 0 .. n the index int32 of the first value >= k in an ascending array."""
 
     def peak_bytes(self) -> int:
-        """Return the largest memory that arrays took on a GPU so far, bytes."""
+        """Return the peak GPU memory of the arrays so far, in bytes."""
         ...
 
 
 def checked_total(total: int) -> int:
-    """Return the number of pairs of a Gaussian and a tile, if it fits into int32.
+    """Return `total`, the number of pairs of a Gaussian and a tile, if it fits into int32.
 
     Raises:
-        ConfigError: There are more pairs.
+        ConfigError: `total` does not fit into int32.
     """
     if total > MAX_PAIRS:
         raise ConfigError(
@@ -80,7 +80,7 @@ class HostArray:
     """NumPy array with the methods of a tensor that the interpreter of Triton calls.
 
     The interpreter copies the memory of a tensor to the host before a launch and back after it.
-    Here both are the same memory.
+    Tensors of this class are in host memory already, so the copy is the tensor itself.
     """
 
     def __init__(self, values: np.ndarray) -> None:

@@ -1,12 +1,12 @@
 """Blending of splats front to back, and its derivative; see `kernels/blend.hpp`.
 
-A tile has 16x16 pixels, in 16 blocks of 4x4 pixels. A pair is a splat and a tile that it may reach.
-The module `projection` describes the layout of a splat.
+A splat is a projected Gaussian; the module `projection` describes its layout. A tile has 16x16
+pixels, in 16 blocks of 4x4 pixels. A pair consists of a splat and a tile that the splat may reach.
 
-A program of one warp blends a tile. The pixels have the shape [16 pixels, 16 blocks], because the
-pixels of a block finish together. In this order, a thread holds eight pixels of one block, so that
-sums over pixels stay in its registers except for one exchange between threads. In the other order,
-each sum takes 32 shuffle instructions instead of 5.
+A Triton program of one warp blends a tile. The pixels have the shape [16 pixels, 16 blocks],
+because the pixels of a block finish together. With this order of axes, a thread holds eight pixels
+of one block, so most of a sum over pixels stays in its registers. Each sum takes 5 shuffle
+instructions; with the other order of axes, it would take 32.
 """
 
 import triton
@@ -28,7 +28,7 @@ CHUNK = tl.constexpr(16)  # The tile checks after this number of pairs whether a
 
 @triton.jit
 def pixels_of(tile, columns):
-    """Return the positions of the pixels and blocks of a tile, given by its number.
+    """Return the positions of the pixels and blocks in the tile with number `tile`.
 
     Returns:
         Column and row of each pixel in the image, [16 pixels, 16 blocks] each. Then column and row
@@ -44,7 +44,7 @@ def pixels_of(tile, columns):
 
 @triton.jit
 def alpha_of(splat, px, py):
-    """Return the capped alpha of a splat at pixels, and the offsets from its center."""
+    """Return the capped alpha of a splat at pixels, and the pixel offsets from its center."""
     dx, dy = px - tl.load(splat), py - tl.load(splat + 1)
     a, b, c = tl.load(splat + 2), tl.load(splat + 3), tl.load(splat + 4)
     log2_alpha = dx * (dx * a + dy * b) + (dy * dy * c + tl.load(splat + 5))
@@ -61,19 +61,21 @@ def largest_of_block(T):
 def blend_forward(splats, listed, reached, starts, columns, width, height, planes, ends):
     """Blend the splats of each tile.
 
-    The pairs of a tile are counted in batches of BATCH. A block checks its transmittance after each
-    fourth splat of the batch that reaches it, and at the end of the batch, like the C++ kernel.
+    A pair consists of a splat and a tile that the splat may reach. A tile has 16 blocks of pixels.
+    The pairs of a tile are processed in batches of `BATCH` pairs. As in the C++ kernel, a block
+    checks its transmittance after every fourth splat that reaches the block, and after each batch.
+    The count of splats starts from 0 in each batch.
 
     Args:
         splats: [N, 16]; the module `projection` describes the layout.
-        listed: Splat of each pair, [P]: tile by tile, front to back.
-        reached: Bit mask of the blocks of the tile that each pair reaches, [P].
-        starts: First pair of each tile, [tiles + 1].
-        columns: Tiles in a row of the image.
+        listed: Index of the splat of each pair, [P]. Pairs are sorted by tile, then front to back.
+        reached: Bit mask of the blocks that the splat of each pair reaches, [P].
+        starts: Index of the first pair of each tile, and P at the end, [tiles + 1].
+        columns: Number of tiles in a row of the image.
         width: Width of the image, pixels.
         height: Height of the image, pixels.
         planes: Output, [5, height, width]: red, green, blue, weighted depth, opacity.
-        ends: Output, [tiles, 16]: number of the pair after the last one that each block blends.
+        ends: Output, [tiles, 16]: for each block, the index of its last blended pair plus 1.
     """
     tile = tl.program_id(0)
     x, y, block_x, block_y = pixels_of(tile, columns)
@@ -133,29 +135,31 @@ def over_pixels(values):
 def blend_backward(
     splats, listed, reached, origins, starts, ends, columns, width, height, planes, by_planes, sums
 ):
-    """Sum the derivatives of each pair over the pixels of its tile.
+    """Sum the derivatives of each pair of a splat and a tile over the pixels of the tile.
 
-    Each pair writes its own row of `sums`. No two programs write the same row, so that no atomic
-    operation is needed, and the bits do not depend on the order of the programs. With
-    v = dL/d ln(alpha), d = pixel - (u, v) and the blending weight w, a row holds the sums of v,
-    v dx, v dy, v dx^2, v dx dy, v dy^2, w dL/dcolor (3), w dL/ddepth and w.
+    Each pair has its own row of `sums`. The programs therefore need no atomic operations, and the
+    bits of the result do not depend on the order of the programs.
 
-    With q = dL/dcolor . color + dL/ddepth z + dL/dopacity of the splat, v is w (q - m). There, m is
-    the mean of q over the splats behind it; see `kernels/blend_gradient.hpp`.
+    Let w be the blending weight of the splat at a pixel, (dx, dy) the offset of the pixel from the
+    center of the splat, and v = dL/d ln(alpha). A row holds the sums of v, v dx, v dy, v dx^2,
+    v dx dy, v dy^2, w dL/dcolor (3 values), w dL/ddepth and w.
+
+    Let q = dL/dcolor . color + dL/ddepth z + dL/dopacity for a splat, and let m be the mean of q
+    over the splats behind that splat. Then v = w (q - m); see `kernels/blend_gradient.hpp`.
 
     Args:
         splats: [N, 16]; the module `projection` describes the layout.
-        listed: Splat of each pair, [P]: tile by tile, front to back.
-        reached: Bit mask of the blocks of the tile that each pair reaches, [P].
-        origins: Row of `sums` that each pair writes, [P]; those of a splat are contiguous.
-        starts: First pair of each tile, [tiles + 1].
+        listed: Index of the splat of each pair, [P]. Pairs are sorted by tile, then front to back.
+        reached: Bit mask of the blocks that the splat of each pair reaches, [P].
+        origins: Row of `sums` for each pair, [P]; the rows of one splat are contiguous.
+        starts: Index of the first pair of each tile, and P at the end, [tiles + 1].
         ends: Output of `blend_forward`, [tiles, 16].
-        columns: Tiles in a row of the image.
+        columns: Number of tiles in a row of the image.
         width: Width of the image, pixels.
         height: Height of the image, pixels.
         planes: Output of `blend_forward`, [5, height, width].
         by_planes: Derivatives of the loss with respect to the planes, [5, height, width].
-        sums: Output, [P, 16], which holds zeros before.
+        sums: Output, [P, 16]; must hold zeros before the call.
     """
     tile = tl.program_id(0)
     x, y, _block_x, _block_y = pixels_of(tile, columns)

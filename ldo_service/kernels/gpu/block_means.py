@@ -7,7 +7,7 @@ from .arithmetic import kernel
 
 @kernel
 def block_means(planes, width, height, side, across, down, out, LANES: tl.constexpr):
-    """Average color and opacity over blocks of side x side pixels, one program per mean.
+    """Average color and opacity over blocks of side x side pixels; each program computes one mean.
 
     Args:
         planes: Rendering, [5, height, width]: red, green, blue, weighted depth, opacity.

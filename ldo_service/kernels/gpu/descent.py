@@ -39,12 +39,15 @@ class AdamState:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Derivatives:
-    """Derivatives of the loss: those of the Gaussians on the device, those of the pose on the host.
+    """Derivatives of the loss L with respect to the visible Gaussians and the camera pose.
 
     Attributes:
-        rows: Derivatives with respect to the visible rows, [V, 16]; undefined after a step of Adam.
-        weights: Blending weights of the visible rows summed over the pixels, [V].
-        xi: dL/dxi at xi = 0 of T_map_camera exp(xi), [6] float64: rotation rad, translation m.
+        rows: Derivatives with respect to the parameters of the visible Gaussians, [V, 16], on the
+            device; undefined after a step of Adam.
+        weights: Blending weights of the visible Gaussians, summed over the pixels, [V], on the
+            device.
+        xi: Derivative with respect to the pose T_map_camera * exp(xi) at xi = 0, [6] float64, on
+            the host: rotation (per rad), then translation (per m).
     """
 
     rows: Any
@@ -53,7 +56,10 @@ class Derivatives:
 
 
 def bias_corrections(beta1: float, beta2: float) -> np.ndarray:
-    """Return 1 / (1 - beta^steps) of both moments by the number of steps, [1024, 2] float32."""
+    """Return the bias corrections of both moments of Adam, [1024, 2] float32.
+
+    Row n contains 1 / (1 - beta^n) for n steps. Row 0 contains 1.
+    """
     betas = np.array([beta1, beta2], np.float32).astype(float)
     powers = np.cumprod(np.tile(betas, (CORRECTIONS - 1, 1)), axis=0)
     return np.vstack([np.ones((1, 2)), 1 / (1 - powers)]).astype(np.float32)
@@ -71,18 +77,24 @@ def backpropagate(
     needle_ratio: float = 1.0,
     max_sigma_px: float = inf,
 ) -> Derivatives:
-    """Differentiate a rendering; with `adam`, take a step instead of returning the derivatives.
+    """Differentiate a rendering; if `adam` is given, also take a step of Adam.
 
     Args:
         arrays: Arrays of the device.
-        rows: Rows of the rendering, unchanged since then; a step changes them in place.
+        rows: Parameters of the rendered Gaussians, [N, 16], unchanged since the rendering. A step
+            changes them in place.
         rendering: The rendering.
         by_planes: Derivatives of the loss with respect to the planes, [5, H, W].
-        adam: State of Adam, which changes in place.
-        rates: Learning rate of each column, [16] float32; needed with `adam`.
-        needle_weight: Weight of the penalty on needles; see `Rasterizer.gradients`.
+        adam: State of Adam, which a step changes in place; None to take no step.
+        rates: Learning rate of each column of `rows`, [16] float32; needed with `adam`.
+        needle_weight: Weight of the penalty on needle-shaped Gaussians; see
+            `Rasterizer.gradients`.
         needle_ratio: Ratio of the longest to the middle axis above which the penalty applies.
-        max_sigma_px: Limit on the standard deviations after a step, in pixels of the image.
+        max_sigma_px: Largest standard deviation of a Gaussian after a step, in pixels of the
+            image.
+
+    Returns:
+        The derivatives; `rows` is undefined if `adam` is given.
     """
     lists = rendering.lists
     sums = arrays.zeros((len(lists.listed), ROW), np.float32)

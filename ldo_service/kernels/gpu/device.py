@@ -1,4 +1,4 @@
-"""Search for a GPU that the kernels can use, and choice between it and the CPU."""
+"""Search for a GPU that the kernels can use, and choice between GPU and CPU."""
 
 import logging
 import platform
@@ -23,11 +23,12 @@ MIN_CAPABILITY = 75
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Gpu:
-    """A GPU.
+    """GPU that the kernels can use.
 
     Attributes:
         name: Model, such as "NVIDIA GeForce RTX 3090".
-        versions: Versions that determine the bits of the results, by name.
+        versions: Versions of libraries and hardware on which the bits of the results depend, by
+            name.
         arrays: Arrays on this GPU.
     """
 
@@ -42,10 +43,11 @@ class DeviceChoice:
 
     Attributes:
         device: cpu or cuda.
-        reason: Sentence that says why.
+        reason: Sentence that says why this device was chosen.
         name: Instruction set of the CPU, or model of the GPU.
-        versions: Versions that determine the bits of the results; empty on the CPU.
-        has_failed: A GPU was found or asked for, and the CPU replaces it.
+        versions: Versions of libraries and hardware on which the bits of the results depend;
+            empty on the CPU.
+        has_failed: True if the CPU is used although a GPU was found or requested.
     """
 
     device: str
@@ -55,7 +57,7 @@ class DeviceChoice:
     has_failed: bool = False
 
     def failed(self, error: DeviceError) -> "DeviceChoice":
-        """Return the choice after a failure of the GPU."""
+        """Return the choice of the CPU that replaces a failed GPU."""
         return replace(on_cpu(f"the GPU {self.name} failed: {error}"), has_failed=True)
 
     def metrics(self) -> dict[str, float]:
@@ -64,7 +66,7 @@ class DeviceChoice:
 
 
 def on_cpu(reason: str) -> DeviceChoice:
-    """Return the choice of the CPU."""
+    """Return a choice of the CPU, with the reason for it."""
     return DeviceChoice("cpu", reason, isa())
 
 
@@ -74,14 +76,14 @@ def choose_device(
     """Choose a device: a GPU if it passes a self-test, otherwise the CPU.
 
     Args:
-        wanted: Setting `service.device`. A GPU is used with auto and cuda. If it is missing, that
-            is a failure with cuda alone.
+        wanted: Setting `service.device`. The settings auto and cuda use a GPU if there is one. A
+            missing GPU counts as a failure with cuda, but not with auto.
         actor: Actor that uses the device, for the log.
         work: What the device does, such as "the map is fitted", for the log.
         make: Function that runs the self-test on a GPU and returns what computes on it.
 
     Returns:
-        The result of `make`, or None for the CPU; and the choice.
+        The result of `make` (None if the CPU is chosen), and the choice.
     """
     if wanted not in ("auto", "cuda"):
         return None, on_cpu(f"service.device={wanted} was chosen.")
@@ -125,11 +127,12 @@ def find_gpu() -> Gpu:
 def device_errors(what: str) -> Iterator[None]:
     """Convert errors in a `with` block to DeviceError.
 
-    torch, Triton and the driver raise errors of several classes, without a common base class. An
-    error of this program is converted too. Callers therefore log the traceback of the cause.
+    torch, Triton and the driver raise errors of several classes, without a common base class.
+    Therefore all exceptions are converted, including those of programming errors. Callers log the
+    traceback of the cause, so that a programming error stays visible.
 
     Args:
-        what: What the block does, for the error text.
+        what: Name of the operation in the block, for the error text.
 
     Raises:
         DeviceError: The block raised an error.
@@ -155,8 +158,8 @@ def _found(torch: Any, triton: Any) -> Gpu:
     name, (major, minor) = torch.cuda.get_device_name(0), torch.cuda.get_device_capability(0)
     if 10 * major + minor < MIN_CAPABILITY:
         raise DeviceError(
-            f"the GPU {name} has compute capability {major}.{minor}, and the kernels need "
-            f"{MIN_CAPABILITY / 10:.1f}. Use the CPU."
+            f"the GPU {name} has compute capability {major}.{minor}, but the kernels need "
+            f"at least {MIN_CAPABILITY / 10:.1f}. Use another GPU, or set service.device=cpu."
         )
     found = {
         "compute capability": f"{major}.{minor}",

@@ -1,4 +1,4 @@
-"""Normal equations of direct alignment: launches of the kernels in `residuals`."""
+"""Normal equations of direct alignment, summed by the GPU kernels of the module `residuals`."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -23,7 +23,7 @@ class Texels:
     """Texels of an image on the device.
 
     Attributes:
-        values: [height, width, 4].
+        values: Gray level, its derivatives along u and v, and depth, [height, width, 4].
         width: Width of the image, pixels.
         height: Height of the image, pixels.
     """
@@ -38,7 +38,7 @@ class Points:
     """Reference points on the device.
 
     Attributes:
-        values: [7, count].
+        values: Coordinates (3), gray level and normal (3) of each point, [7, count].
         count: Number of points.
     """
 
@@ -54,25 +54,30 @@ def problem_of(
     gate: float,
     occlusion: float,
 ) -> np.ndarray:
-    """Return the 25 float32 values of a problem; the module `residuals` describes their layout.
+    """Return the input of the alignment kernels, [25] float32; see the module `residuals`.
 
     Args:
-        T_camera_reference: Pose, [4, 4] or [3, 4].
+        T_camera_reference: Transform from the reference to the camera, [4, 4] or [3, 4].
         intrinsics: fx, fy, cx, cy of the frame, pixels.
         brightness: Gain, bias and noise of gray levels.
-        depth_noise: Factor on the noise of depth, then its floor, growth and nearest depth.
-        gate: Largest depth difference of a point and the frame, as a fraction of its depth.
-        occlusion: Depth difference from which a point is hidden, as a fraction of the depth.
+        depth_noise: Values (scale, floor, growth, nearest). The noise at a depth z in meters is
+            scale * (floor + growth * (z - nearest)^2), a standard deviation in meters.
+        gate: Largest depth difference between a point and the frame, as a fraction of the depth of
+            the point.
+        occlusion: Depth difference beyond which a point is hidden behind the measured surface, as a
+            fraction of the measured depth.
     """
     T = np.asarray(T_camera_reference)[:3].reshape(-1)
     return np.array([*T, *intrinsics, *brightness, *depth_noise, gate, occlusion], np.float32)
 
 
 def strip_cells(cells: np.ndarray) -> np.ndarray:
-    """Return the cell of each strip of 16 points, that of its middle point.
+    """Return the image cell of each strip of 16 consecutive points.
+
+    The cell of a strip is the cell of its middle point.
 
     Args:
-        cells: Cell of each point, [N] uint8.
+        cells: Number of the image cell of each point, [N] uint8.
     """
     middles = np.arange(0, len(cells), STRIP) + STRIP // 2
     return cells[np.minimum(middles, len(cells) - 1)]
@@ -88,11 +93,13 @@ def sum_equations(
         points: Reference points.
         texels: Texels of the frame.
         problem: Pose, intrinsics and settings, [25] float32; see `residuals`.
-        cells: Cell of each strip of points on the device; None if no gradients by cell are needed.
+        cells: Output of `strip_cells`, on the device; None if no gradients per image cell are
+            needed.
 
     Returns:
-        The sums, [51] float64. Then the gradients of the photometric and of the geometric residuals
-        by cell, [64, 2, 8] float64; [0, 2, 8] without `cells`.
+        The sums, [51] float64, in the order that `residuals` describes. Then the gradients of the
+        photometric and of the geometric residuals per image cell, [64, 2, 8] float64. Without
+        `cells`, their shape is [0, 2, 8].
     """
     by_cell = np.zeros((0 if cells is None else CELLS, 2, 8))
     n = points.count

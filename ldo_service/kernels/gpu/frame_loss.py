@@ -20,7 +20,7 @@ class Frame:
         color: [3, H, W] uint8.
         depth_m: [H, W] float32; 0 where not measured.
         mask: [H, W] uint8, 0 where the pixel is ignored.
-        measured: Number of depths that count.
+        measured: Number of pixels that have a depth and are not ignored.
     """
 
     color: Any
@@ -41,13 +41,13 @@ def image_loss(
     Args:
         arrays: Arrays of the device.
         rendering: The rendering.
-        frame: Images of the same size.
+        frame: Images of the keyframe, of the same size as the rendering.
         exposure: Gains of the three channels, then biases, [2, 3] float32.
         weights: Weights of L1, D-SSIM and depth.
 
     Returns:
-        dL/dplanes [5, H, W] on the device: red, green, blue, weighted depth, opacity. Then L1,
-        D-SSIM, depth error and squared error as means, [4] float64.
+        dL/dplanes [5, H, W] on the device: red, green, blue, weighted depth, opacity. Then the
+        means of L1, D-SSIM, depth error in meters and squared color error, [4] float64.
     """
     width, height, planes = rendering.width, rendering.height, rendering.planes
     pixels = width * height

@@ -1,11 +1,13 @@
 """Image loss of a rendering and its derivatives: L1, SSIM and depth; see `kernels/loss.cpp`.
 
-The loss compares x with y: x is the rendering with the exposure of the frame applied, y is the
-frame, both in 0..1. The window of SSIM, a Gaussian, is applied along rows, then along columns,
-first to the images and then to the derivatives of SSIM with respect to the windowed means.
+The loss compares two images x and y with values in 0..1. x is the rendering with the exposure of
+the frame applied, and y is the frame. SSIM uses means over a Gaussian window, which is applied
+along rows and then along columns. The kernels first apply the window to the images. They then apply
+it to the derivatives of SSIM with respect to these means.
 
-One lane computes one value of [3, H, W]. Its index there is `at`, and `pixel` is its index in
-[H, W]. `is_live` is false for lanes of the last program that have no value.
+One lane of a Triton program computes one value of an image [3, H, W]. `at` is the index of the
+value in [3, H, W], and `pixel` is the index of its pixel in [H, W]. `is_live` is false for lanes of
+the last program that have no value.
 """
 
 import triton
@@ -26,7 +28,7 @@ C2 = tl.constexpr(0.03 * 0.03)
 
 @triton.jit
 def tap(k: tl.constexpr):
-    """Return the weight of the window at k pixels from its middle; all weights add up to 1."""
+    """Return the weight of the SSIM window at k pixels from its middle; all 11 add up to 1."""
     if k == 0:
         return TAP0
     elif (k == 1) | (k == -1):  # noqa: RET505
@@ -43,7 +45,10 @@ def tap(k: tl.constexpr):
 
 @triton.jit
 def place_of(width, height, BLOCK: tl.constexpr):
-    """Return `at`, channel, `pixel`, row, column and `is_live` of each lane; see the module."""
+    """Return `at`, channel, `pixel`, row, column and `is_live` of each lane.
+
+    The module describes `at`, `pixel` and `is_live`.
+    """
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     size = width * height
     pixel = at % size
@@ -52,7 +57,10 @@ def place_of(width, height, BLOCK: tl.constexpr):
 
 @triton.jit
 def exposed_at(planes, color, mask, exposure, at, channel, pixel, is_live):
-    """Return x, y, where they count, and the gain; x and y are 0 where the mask is 0."""
+    """Return the values of x and y, whether the mask keeps the pixel, and the gain.
+
+    x and y are 0 where the mask is 0; the module describes them.
+    """
     counts = is_live & (tl.load(mask + pixel, is_live, 0) != 0)
     gain = tl.load(exposure + channel, is_live, 0.0)
     bias = tl.load(exposure + 3 + channel, is_live, 0.0)
@@ -63,17 +71,17 @@ def exposed_at(planes, color, mask, exposure, at, channel, pixel, is_live):
 
 @kernel
 def means_along_rows(planes, color, mask, exposure, width, height, out, BLOCK: tl.constexpr):
-    """Apply the window along rows to x, y, x^2 + y^2 and x y; the module defines x and y.
+    """Apply the SSIM window along rows to x, y, x^2 + y^2 and x y; the module describes x and y.
 
     Args:
         planes: Rendering, [5, H, W]: red, green, blue, weighted depth, opacity.
         color: Frame, [3, H, W] uint8.
-        mask: Pixels that count, [H, W] uint8.
+        mask: 0 for ignored pixels, [H, W] uint8.
         exposure: Gains of the three channels, then biases, [2, 3].
-        width: W.
-        height: H.
-        out: Output, [4, 3, H, W].
-        BLOCK: Lanes of a program.
+        width: Width W of the images, pixels.
+        height: Height H of the images, pixels.
+        out: Output, [4, 3, H, W]: means of the four images along rows.
+        BLOCK: Number of lanes of a Triton program.
     """
     at, channel, pixel, _row, column, is_live = place_of(width, height, BLOCK)
     zero = tl.zeros([BLOCK], tl.float32)
@@ -96,7 +104,7 @@ def means_along_rows(planes, color, mask, exposure, width, height, out, BLOCK: t
 
 @triton.jit
 def window_along_columns(images, at, row, width, height, is_live):
-    """Apply the window along columns to images [3, H, W], at the index `at` of each lane."""
+    """Apply the SSIM window along columns to images [3, H, W], at the index `at` of each lane."""
     out = tl.zeros_like(row).to(tl.float32)
     for k in tl.static_range(-5, 6):
         is_inside = is_live & (row + k >= 0) & (row + k < height)
@@ -106,16 +114,16 @@ def window_along_columns(images, at, row, width, height, is_live):
 
 @kernel
 def ssim_derivatives(along_rows, width, height, out, ssims, BLOCK: tl.constexpr):
-    """Apply the window along columns, and compute SSIM and its derivatives.
+    """Apply the SSIM window along columns, and compute SSIM and its derivatives.
 
     Args:
         along_rows: Output of `means_along_rows`, [4, 3, H, W].
-        width: W.
-        height: H.
-        out: Output, [3, 3, H, W]: derivatives of SSIM with respect to the windowed x, x^2 + y^2
-            and x y; the module defines x and y.
-        ssims: Output, [programs]: sum of SSIM over the values of each program.
-        BLOCK: Lanes of a program.
+        width: Width W of the images, pixels.
+        height: Height H of the images, pixels.
+        out: Output, [3, 3, H, W]: derivatives of SSIM with respect to the window means of x,
+            x^2 + y^2 and x y; the module describes x and y.
+        ssims: Output, [programs]: sum of SSIM over the values of each Triton program.
+        BLOCK: Number of lanes of a Triton program.
     """
     at, _channel, _pixel, row, _column, is_live = place_of(width, height, BLOCK)
     size = 3 * width * height
@@ -139,7 +147,7 @@ def ssim_derivatives(along_rows, width, height, out, ssims, BLOCK: tl.constexpr)
 
 @kernel
 def derivatives_along_rows(derivatives, width, height, out, BLOCK: tl.constexpr):
-    """Apply the window along rows to the output [3, 3, H, W] of `ssim_derivatives`."""
+    """Apply the SSIM window along rows to the output [3, 3, H, W] of `ssim_derivatives`."""
     at, _channel, _pixel, _row, column, is_live = place_of(width, height, BLOCK)
     size = 3 * width * height
     for image in tl.static_range(3):
@@ -169,22 +177,23 @@ def color_gradient(
 ):
     """Compute the derivatives of the loss with respect to the rendered colors.
 
-    The kernel also sums L1 and the squared error.
+    The kernel also sums the absolute and the squared errors.
 
     Args:
         planes: Rendering, [5, H, W]: red, green, blue, weighted depth, opacity.
         color: Frame, [3, H, W] uint8.
-        mask: Pixels that count, [H, W] uint8.
+        mask: 0 for ignored pixels, [H, W] uint8.
         exposure: Gains of the three channels, then biases, [2, 3].
         along_rows: Output of `derivatives_along_rows`, [3, 3, H, W].
-        width: W.
-        height: H.
-        l1: Weight of L1, divided by the number of values 3 H W.
-        d_ssim: Minus the weight of D-SSIM = 1 - SSIM, divided by the number of values.
-        by_planes: Output, [5, H, W] like `planes`, of which the colors are written.
-        l1s: Output, [programs]: sum of the absolute errors of each program.
-        squares: Output, [programs]: sum of the squared errors of each program.
-        BLOCK: Lanes of a program.
+        width: Width W of the images, pixels.
+        height: Height H of the images, pixels.
+        l1: Weight of the loss term L1, divided by 3 H W.
+        d_ssim: Negative weight of the loss term 1 - SSIM, divided by 3 H W.
+        by_planes: Output, [5, H, W]: derivatives with respect to `planes`. This kernel writes those
+            of the three colors.
+        l1s: Output, [programs]: sum of the absolute errors of each Triton program.
+        squares: Output, [programs]: sum of the squared errors of each Triton program.
+        BLOCK: Number of lanes of a Triton program.
     """
     at, channel, pixel, row, _column, is_live = place_of(width, height, BLOCK)
     size = 3 * width * height
@@ -212,18 +221,21 @@ def depth_gradient(
 ):
     """Compute the derivatives of the loss with respect to the rendered depth and opacity.
 
-    Those with respect to the opacity are 0. The kernel also sums the depth errors.
+    The derivatives with respect to the opacity are 0. The kernel also sums the absolute depth
+    errors.
 
     Args:
         planes: Rendering, [5, H, W]: red, green, blue, weighted depth, opacity.
-        depth_m: Depth of the frame, [H, W]; 0 where not measured.
-        mask: Pixels that count, [H, W] uint8.
-        width: W.
-        height: H.
-        step: Weight of the depth error, divided by the number of depths that count.
-        by_planes: Output, [5, H, W] like `planes`, of which depth and opacity are written.
-        errors: Output, [programs]: sum of the depth errors of each program.
-        BLOCK: Lanes of a program.
+        depth_m: Depth of the frame, [H, W], meters; 0 where not measured.
+        mask: 0 for ignored pixels, [H, W] uint8.
+        width: Width W of the images, pixels.
+        height: Height H of the images, pixels.
+        step: Weight of the depth error, divided by the number of pixels that have a depth and
+            are not ignored.
+        by_planes: Output, [5, H, W]: derivatives with respect to `planes`. This kernel writes those
+            of depth and opacity.
+        errors: Output, [programs]: sum of the absolute depth errors of each Triton program.
+        BLOCK: Number of lanes of a Triton program.
     """
     at = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     size = width * height

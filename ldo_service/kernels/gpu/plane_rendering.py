@@ -1,8 +1,8 @@
 """Rendering of color, depth and opacity in an iteration of the Gaussian optimizer.
 
-Arrays of the device come from an `Arrays`. No kernel uses atomic operations: each program writes
-its own values, and the host adds sums of programs in a fixed order. The results are therefore
-bitwise equal on one GPU model and one version of Triton.
+An `Arrays` object allocates the arrays on the device. No kernel uses atomic operations: each Triton
+program writes its own sums, and the host adds them in a fixed order. Repeated runs on one GPU model
+and one version of Triton therefore give bitwise equal results.
 """
 
 from dataclasses import dataclass
@@ -29,9 +29,9 @@ def view_of(
     """Return the 18 float32 values of a view; the module `projection` describes their layout.
 
     Args:
-        T_camera_map: [4, 4] or [3, 4].
+        T_camera_map: Transform from the map to the camera, [4, 4] or [3, 4].
         intrinsics: fx, fy, cx, cy of the rendered image, pixels.
-        binning: Number of full-image pixels along each side of a pixel, 1 or 2.
+        binning: Width of a pixel of the rendered image in pixels of the full image, 1 or 2.
 
     Raises:
         ValueError: `binning` is neither 1 nor 2.
@@ -46,12 +46,12 @@ def view_of(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Splats:
-    """Projection of N Gaussians.
+    """Splats, the projections of N Gaussians, and the tiles that they may reach.
 
     Attributes:
-        splats: [N, 16]; the module `projection` describes the layout.
-        ranges: Tiles x0 y0 x1 y1 of each splat, both ends included, [N, 4].
-        pairs: Number of tiles of each splat, [N]; 0 if it is not drawn.
+        splats: Splats, [N, 16]; the module `projection` describes the layout.
+        ranges: First tile (x0, y0) and last tile (x1, y1) of each splat, both included, [N, 4].
+        pairs: Number of tiles of each splat, [N]; 0 if the splat is not drawn.
     """
 
     splats: Any
@@ -61,19 +61,20 @@ class Splats:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TileLists:
-    """Pairs of a splat and a tile that it may reach, sorted by tile, then depth, then row.
+    """P pairs of a splat and a tile that it may reach, sorted by tile, then depth, then row.
 
     A row is the index of a Gaussian, and of its splat. Before the sort by tile, the pairs of a
     splat are contiguous.
 
     Attributes:
-        visible: Rows that are drawn, [V], ascending.
-        firsts: Index of the first pair of each row before the sort by tile, [N]; undefined for rows
-            that are not drawn.
+        visible: Rows of the V drawn splats, [V], ascending.
+        firsts: For each row, the index of its first pair before the sort by tile, [N]; undefined
+            for rows that are not drawn.
         listed: Row of each pair, [P].
-        reached: Bit mask of each pair: the blocks of 4x4 pixels that its splat may reach, [P].
+        reached: For each pair, a bit mask of the blocks of 4x4 pixels of the tile that the splat
+            may reach, [P].
         origins: Index of each pair before the sort by tile, [P].
-        starts: First pair of each tile, [tiles + 1].
+        starts: Index of the first pair of each tile, then the number of pairs, [tiles + 1].
     """
 
     visible: Any
@@ -90,13 +91,13 @@ class PlaneRendering:
 
     Attributes:
         view: Output of `view_of`, on the device.
-        focal_px: Larger one of fx and fy, pixels.
+        focal_px: Larger focal length, max(fx, fy), pixels.
         width: Width of the image, pixels.
         height: Height of the image, pixels.
         splats: Projected Gaussians.
-        lists: Pairs of splats and tiles.
+        lists: Pairs of a splat and a tile.
         planes: [5, height, width]: red, green, blue, weighted depth, opacity.
-        ends: For the 16 blocks of each tile, the index of the pair after the last blended one,
+        ends: For each block of 4x4 pixels, the index of the pair after the last blended pair,
             [tiles, 16].
     """
 
@@ -149,8 +150,8 @@ def project(arrays: Arrays, rows: Any, n: int, view: Any, width: int, height: in
 def list_tiles(arrays: Arrays, splats: Splats, width: int, height: int) -> TileLists:
     """List the pairs of splats and tiles, in two stable sorts.
 
-    The visible splats are sorted by depth, and then the more numerous pairs by tile. At equal
-    depths, the lower row comes first.
+    The first sort orders the visible splats by depth. The second sort orders the pairs, which are
+    more numerous, by tile. At equal depths, the splat with the lower row index comes first.
     """
     columns, tile_rows = -(-width // TILE), -(-height // TILE)
     visible = arrays.nonzero(splats.pairs)
@@ -195,7 +196,7 @@ def render(
         arrays: Arrays of the device.
         rows: Gaussians on the device, [N, 16].
         n: Number of Gaussians, at most N.
-        view: Output of `view_of`.
+        view: Output of `view_of`, on the host.
         width: Width of the image, pixels.
         height: Height of the image, pixels.
     """

@@ -1,7 +1,7 @@
 """Projection of Gaussians to splats, and pairs of splats and tiles; see `kernels/projection.hpp`.
 
-A row of a Gaussian has 16 floats: mean 0-2, log scale 3-5, quaternion wxyz 6-9, opacity logit 10,
-color 11-13, two unused.
+A Gaussian is a row of 16 floats. Its columns are: mean 0-2, log scale 3-5, quaternion wxyz 6-9,
+opacity logit 10, color 11-13, unused 14-15.
 
 A splat, the projection of a Gaussian, has 16 floats: u v | a b c log2_opacity | x_slope y_slope |
 red green blue | z | four unused. At the offset (x, y) from its center (u, v) in pixels, log2 of
@@ -9,8 +9,8 @@ alpha is a x^2 + b x y + c y^2 + log2_opacity. Alpha is largest at x = x_slope y
 at y = y_slope x for a given x.
 
 A view has 18 floats: T_camera_map row by row (12), fx fy cx cy, low_pass, box. The last two are
-variances in px^2: low_pass is added to the covariance of each splat, and box is the part of it that
-stands for the average over the pixels of a binned image.
+variances in px^2. low_pass is added to the covariance of each splat. box is the part of low_pass
+that stands for the averaging of full-image pixels in a binned image.
 
 A pair is a splat and a tile of 16x16 pixels that it may reach. A tile has 16 blocks of 4x4 pixels.
 """
@@ -28,12 +28,10 @@ TILE = tl.constexpr(16)  # Pixels.
 
 @triton.jit
 def camera_of(view, width, height):
-    """Return the rows of the rotation, the translation, the lens, the limits and the filter.
+    """Return the three rows of the rotation, the translation, the lens, the limits and the filter.
 
-    The lens is (fx, fy, cx, cy). The limits bound x / z and y / z where the projection is
-    linearized. The filter is (low_pass, box), two variances in px^2: low_pass is added to the
-    covariance of each splat, and box is the part of it due to the averaging of pixels. The module
-    describes the layout of `view`.
+    The lens is (fx, fy, cx, cy). The limits are the bounds to which `jacobian` clamps x / z and
+    y / z. The filter is (low_pass, box), which the module describes together with `view`.
     """
     R0 = (tl.load(view), tl.load(view + 1), tl.load(view + 2))
     R1 = (tl.load(view + 4), tl.load(view + 5), tl.load(view + 6))
@@ -58,12 +56,13 @@ def to_camera(mean, R0, R1, R2, t):
 
 @triton.jit
 def jacobian(p, R0, R1, R2, lens, limits):
-    """Return the derivatives of u and v with respect to a point of the map, and shared values.
+    """Return the derivatives of the pixel (u, v) with respect to a point, and intermediate values.
 
-    The point p is in the camera frame; `camera_of` describes the other arguments. The shared values
-    are 1 / z, x / z, y / z and (ju, jv, ku, kv). With respect to the point in the camera frame, the
-    derivative of u is (ju, 0, -ku), and that of v is (0, jv, -kv). The viewing direction is clamped
-    to `limits`, because the affine model fails farther outside.
+    p = (x, y, z) is the point in the camera frame, and the derivatives are with respect to the
+    point in the map frame. `camera_of` describes the other arguments. The intermediate values are
+    1 / z, x / z, y / z and (ju, jv, ku, kv). With respect to p, the derivative of u is
+    (ju, 0, -ku), and the derivative of v is (0, jv, -kv). The slopes x / z and y / z in ku and kv
+    are clamped to `limits`, because the affine approximation fails outside of these limits.
     """
     inverse_z = tl.div_rn(1.0, tl.maximum(p[2], NEAR))
     x, y = p[0] * inverse_z, p[1] * inverse_z
@@ -76,7 +75,10 @@ def jacobian(p, R0, R1, R2, lens, limits):
 
 @triton.jit
 def principal_axes(q, sigmas):
-    """Return the columns of the rotation of a quaternion of any length, scaled by `sigmas`."""
+    """Return the columns of the rotation matrix of a quaternion, scaled by `sigmas`.
+
+    The quaternion may have any length.
+    """
     w, x, y, z = q[0], q[1], q[2], q[3]
     s = tl.div_rn(2.0, w * w + x * x + y * y + z * z)
     sx, sy, sz = s * x, s * y, s * z
@@ -91,9 +93,10 @@ def principal_axes(q, sigmas):
 
 @triton.jit
 def quaternion_gradient(q, g0, g1, g2):
-    """Convert derivatives from the columns of a rotation to its quaternion of any length.
+    """Return the derivatives with respect to a quaternion from those of its rotation matrix.
 
-    The length of the quaternion has no effect, so the radial part of the gradient is removed.
+    g0, g1 and g2 are the derivatives with respect to the columns of the matrix. The quaternion may
+    have any length. Its length has no effect, so the radial part of the gradient is removed.
     """
     shorten = tl.div_rn(1.0, tl.sqrt_rn(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]))
     w, x, y, z = q[0] * shorten, q[1] * shorten, q[2] * shorten, q[3] * shorten
@@ -116,10 +119,10 @@ def quaternion_gradient(q, g0, g1, g2):
 
 @triton.jit
 def image_covariance(along_u, along_v, low_pass):
-    """Return uu, uv and vv of the covariance of a splat, px^2.
+    """Return the entries uu, uv and vv of the covariance of a splat, px^2.
 
-    The three axes of the Gaussian, each one standard deviation long, appear in the image with the
-    lengths `along_u` and `along_v`, px. `low_pass` is the variance that is added, px^2.
+    `along_u` and `along_v` are the u and v components of the three projected axes, px. Each axis of
+    the Gaussian is one standard deviation long. `low_pass` is added to both variances, px^2.
     """
     uu = low_pass + along_u[0] * along_u[0] + along_u[1] * along_u[1] + along_u[2] * along_u[2]
     uv = along_u[0] * along_v[0] + along_u[1] * along_v[1] + along_u[2] * along_v[2]
@@ -129,9 +132,9 @@ def image_covariance(along_u, along_v, low_pass):
 
 @triton.jit
 def load_row(rows, i, is_live):
-    """Return mean, log scales, quaternion, opacity logit and color of the Gaussians i.
+    """Return mean, log scales, quaternion, opacity logit and color of the Gaussians with index i.
 
-    Lanes that are not live get the quaternion of no rotation and zeros.
+    Lanes that are not live get the identity quaternion, and zeros for the other values.
     """
     at = rows + i.to(tl.int64) * ROW
     mean = (tl.load(at, is_live, 0.0), tl.load(at + 1, is_live, 0.0), tl.load(at + 2, is_live, 0.0))
@@ -157,7 +160,10 @@ def load_row(rows, i, is_live):
 
 @triton.jit
 def pixels_within(center, radius, size):
-    """Return the first and last pixel of [0, size) within `radius`, and whether one exists."""
+    """Return the first and last pixel within `radius` of `center`, and whether one exists.
+
+    Pixels are the integers in [0, size).
+    """
     edge = size.to(tl.float32) - 1.0
     low, high = center - radius, center + radius
     # NaN fails this comparison. It must come first, because the maximum of NaN and 0 is 0 on a GPU.
@@ -180,10 +186,10 @@ def project_and_cull(rows, n, view, width, height, splats, ranges, pairs, BLOCK:
         width: Width of the image, pixels.
         height: Height of the image, pixels.
         splats: Output, [n, 16]; the module describes the layout.
-        ranges: Output, [n, 4]: tiles x0 y0 x1 y1 of the box that holds each pixel with
-            alpha >= 1/255.
+        ranges: Output, [n, 4]: first tile (x0, y0) and last tile (x1, y1) of the bounding box of
+            the pixels with alpha >= 1/255.
         pairs: Output, [n]: number of tiles of the box; 0 if the Gaussian is not drawn.
-        BLOCK: Lanes of a program.
+        BLOCK: Number of lanes of a Triton program.
     """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     is_live = i < n
@@ -240,14 +246,15 @@ def project_and_cull(rows, n, view, width, height, splats, ranges, pairs, BLOCK:
 
 @kernel
 def depth_keys(splats, visible, n, keys, BLOCK: tl.constexpr):
-    """Write a key for each visible splat, by which integers sort like the depths.
+    """Write an integer sort key for each visible splat; the keys sort like the depths.
 
     Args:
-        splats: [N, 16]; the module describes the layout.
-        visible: Rows that are drawn, [n].
-        n: Number of these rows.
-        keys: Output, [n] int32: bits of the depth. They sort like it, because depths are positive.
-        BLOCK: Lanes of a program.
+        splats: Splats, [N, 16]; the module describes the layout.
+        visible: Indices of the drawn splats, [n].
+        n: Number of drawn splats.
+        keys: Output, [n] int32: the bits of the float32 depth. These integers sort like the depths,
+            because depths are positive.
+        BLOCK: Number of lanes of a Triton program.
     """
     lane = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     is_live = lane < n
@@ -268,16 +275,17 @@ def list_pairs(
     """Compute the tile of each pair, and the blocks of 4x4 pixels that its splat reaches.
 
     Args:
-        splats: [N, 16]; the module describes the layout.
-        ranges: Tiles of each splat, [N, 4].
-        owners: Splat of each pair, [n_pairs]; the tiles of a splat are taken row by row.
-        firsts: First pair of each splat, [N].
-        n_pairs: Number of pairs.
-        columns: Tiles in a row of the image.
-        tiles: Output, [n_pairs]: the tile.
+        splats: Splats, [N, 16]; the module describes the layout.
+        ranges: First tile (x0, y0) and last tile (x1, y1) of each splat, [N, 4].
+        owners: Index of the splat of each pair, [n_pairs]. The pairs of a splat are contiguous and
+            follow its tiles row by row.
+        firsts: Index of the first pair of each splat, [N].
+        n_pairs: Number of pairs of a splat and a tile.
+        columns: Number of tiles in a row of the image.
+        tiles: Output, [n_pairs]: number of the tile, row by row.
         reached: Output, [n_pairs]: bit i is set if the ellipse alpha >= 1/255 reaches block i of
             the tile; blocks are numbered row by row.
-        BLOCK: Lanes of a program.
+        BLOCK: Number of lanes of a Triton program.
     """
     pair = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     is_live = pair < n_pairs

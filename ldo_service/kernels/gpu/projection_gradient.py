@@ -1,4 +1,4 @@
-"""Derivative of the projection with a fused step of Adam; see `kernels/projection_gradient.hpp`."""
+"""Projection gradient and step of Adam in one kernel; see `kernels/projection_gradient.hpp`."""
 
 import triton
 import triton.language as tl
@@ -21,8 +21,9 @@ from .projection import (
 def needle_gradient(scale, push, log_ratio):
     """Return the derivatives of the needle penalty with respect to the log scales.
 
-    The penalty is push max(0, log(longest / middle axis) - log_ratio). `push` is the weight of the
-    penalty times the mean blending weight of the Gaussian over the pixels.
+    A needle is a Gaussian with one long axis. The penalty is
+    push * max(0, log(longest axis / middle axis) - log_ratio). `push` is the weight of the penalty
+    times the mean blending weight of the Gaussian over the pixels.
     """
     longest = tl.maximum(scale[0], tl.maximum(scale[1], scale[2]))
     low, high = tl.minimum(scale[0], scale[1]), tl.maximum(scale[0], scale[1])
@@ -43,9 +44,10 @@ def only_at(numbers, number, value):
 
 @triton.jit
 def sums_of_pairs(sums, first, count, BLOCK: tl.constexpr):
-    """Return the eleven sums that `blend_backward` lists, for each splat instead of each pair.
+    """Return the eleven sums of each splat, added up over its pairs.
 
-    A splat has `count` pairs: the rows of `sums` from `first` on.
+    `blend_backward` writes one row of `sums` for each pair of a splat and a tile, and lists the
+    eleven sums. The pairs of a splat are `count` rows, from row `first` on.
     """
     zero = tl.zeros([BLOCK], tl.float32)
     V, Vx, Vy, Vxx, Vxy, Vyy = zero, zero, zero, zero, zero, zero
@@ -69,20 +71,21 @@ def sums_of_pairs(sums, first, count, BLOCK: tl.constexpr):
 
 @triton.jit
 def covariance_gradient(V, Vx, Vy, Vxx, Vxy, Vyy, covariance, box):
-    """Return the derivatives with respect to image position (u, v) and image covariance.
+    """Return the derivatives of the loss L with respect to a splat's center and covariance.
 
     Args:
         V: Sum of v = dL/d(ln alpha) over the pixels.
-        Vx: Sum of v d_x over the pixels, where d is the offset of a pixel from the splat.
+        Vx: Sum of v d_x over the pixels; d is the offset of a pixel from the center (u, v), px.
         Vy: Sum of v d_y.
         Vxx: Sum of v d_x d_x.
         Vxy: Sum of v d_x d_y.
         Vyy: Sum of v d_y d_y.
-        covariance: Entries (uu, uv, vv) of the image covariance.
+        covariance: Entries (uu, uv, vv) of the image covariance, px^2.
         box: Variance of the box filter of binning, px^2; 0 without binning.
 
     Returns:
-        Derivatives with respect to u and v, and twice those for the entries uu, uv and vv.
+        Derivatives with respect to u and v, then twice the derivatives with respect to uu, uv and
+        vv.
     """
     # K is the inverse of the covariance S: dL/dmean = K sum(v d) and 2 dL/dS = K sum(v d d') K.
     uu, uv, vv = covariance
@@ -105,18 +108,19 @@ def covariance_gradient(V, Vx, Vy, Vxx, Vxy, Vyy, covariance, box):
 
 @triton.jit
 def shape_gradient(q, axes, sigmas, jacobian_rows, along, by_covariance):
-    """Return the derivatives with respect to log scales, quaternion and rows of the Jacobian.
+    """Return the derivatives of the loss with respect to log scales, quaternion and Jacobian.
 
     Args:
         q: Quaternion of any length.
-        axes: Principal axes, as long as their standard deviations.
-        sigmas: Standard deviations along the axes.
+        axes: Principal axes in the map frame, each as long as its standard deviation.
+        sigmas: Standard deviations along the axes, meters.
         jacobian_rows: Rows du and dv of the Jacobian, in the map frame.
-        along: Components of these rows along the axes.
-        by_covariance: Twice the derivatives by the entries uu, uv and vv of the image covariance.
+        along: Scalar products of du with the three axes, and of dv with the three axes.
+        by_covariance: Twice the derivatives with respect to the entries uu, uv and vv of the image
+            covariance.
 
     Returns:
-        Derivatives by the three log scales, the quaternion, du and dv.
+        Derivatives with respect to the three log scales, the quaternion, du and dv.
     """
     # The covariance is the low pass plus the sum over axes a of (du.a, dv.a) (du.a, dv.a)'.
     a0, a1, a2 = axes
@@ -146,18 +150,18 @@ def shape_gradient(q, axes, sigmas, jacobian_rows, along, by_covariance):
 
 @triton.jit
 def point_gradient(p, inverse_z, slopes, limits, perspective, by_uv, row_u, row_v, depth):
-    """Return the derivative by the point in the camera frame.
+    """Return the derivative of the loss with respect to the point p in the camera frame.
 
     Args:
-        p: Point in the camera frame.
+        p: Point in the camera frame, meters.
         inverse_z: 1 / z of the point.
         slopes: x / z and y / z of the point.
-        limits: Slopes (x min, x max, y min, y max) up to which the Jacobian follows the point.
-        perspective: Entries (ju, jv, ku, kv) of the derivative of the perspective.
-        by_uv: Derivatives by the image position.
-        row_u: Derivative by the row of u of the Jacobian, in the camera frame.
-        row_v: Derivative by the row of v.
-        depth: Derivative by the depth.
+        limits: Bounds (x min, x max, y min, y max) to which the Jacobian clamps the slopes.
+        perspective: Entries (ju, jv, ku, kv) of the Jacobian; see `projection.jacobian`.
+        by_uv: Derivatives of the loss with respect to the image position (u, v).
+        row_u: Derivative with respect to the row of u of the Jacobian, in the camera frame.
+        row_v: Derivative with respect to the row of v of the Jacobian, in the camera frame.
+        depth: Derivative with respect to the depth z of the point in the depth image.
     """
     ju, jv, ku, kv = perspective
     by_u, by_v = by_uv
@@ -178,12 +182,13 @@ def store_pose(by_pose, p, g, perspective, row_u, row_v, is_live):
     """Store the derivatives with respect to the pose, summed over the Gaussians of the program.
 
     Args:
-        by_pose: Output, [programs, 8]: by rotation (3), by translation (3), and two zeros.
+        by_pose: Output, [programs, 8]: derivatives with respect to rotation (3) and translation
+            (3), then two zeros.
         p: Point in the camera frame.
-        g: Derivative with respect to this point.
+        g: Derivative of the loss with respect to p.
         perspective: (ju, jv, ku, kv); see `projection.jacobian`.
         row_u: Derivative with respect to the row of u of the Jacobian, in the camera frame.
-        row_v: Derivative with respect to the row of v.
+        row_v: Derivative with respect to the row of v of the Jacobian, in the camera frame.
         is_live: True for lanes that have a Gaussian.
     """
     ju, jv, ku, kv = perspective
@@ -203,18 +208,18 @@ def store_pose(by_pose, p, g, perspective, row_u, row_v, is_live):
 def take_step(
     rows, i, gradient, is_live, camera, state, adam, max_sigma_per_depth, LAST_STEP: tl.constexpr
 ):
-    """Take a step of Adam, in place, and limit the sizes.
+    """Take a step of Adam in place, and limit the standard deviations of the Gaussians.
 
     Args:
-        rows: Gaussians, [N, 16].
-        i: Row of each lane.
-        gradient: Derivatives with respect to the columns; the last one is 0.
+        rows: Gaussians, [N, 16]; changed in place.
+        i: Index of the Gaussian of each lane.
+        gradient: Derivatives with respect to the 16 columns of `rows`; the last one is 0.
         is_live: True for lanes that have a Gaussian.
-        camera: Third row of the rotation of T_camera_map, and its translation.
-        state: Moments, squares and steps; see `project_backward`.
-        adam: Rates, corrections, beta1, beta2 and epsilon; see `project_backward`.
-        max_sigma_per_depth: Maximum standard deviation per meter of depth after the step.
-        LAST_STEP: Number of steps after which the correction stays constant.
+        camera: Third row of the rotation matrix, and the translation, of T_camera_map.
+        state: `moments`, `squares` and `steps` of `project_backward`.
+        adam: `rates`, `corrections`, `beta1`, `beta2` and `epsilon` of `project_backward`.
+        max_sigma_per_depth: Maximum standard deviation after the step, as a fraction of the depth.
+        LAST_STEP: Number of steps after which the bias correction of Adam stays constant.
     """
     R2, t = camera
     moments, squares, steps = state
@@ -276,37 +281,38 @@ def project_backward(
     ADAM: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Add the sums of each splat over its tiles, differentiate the projection, and step.
+    """Compute the derivatives with respect to the Gaussians, or take a step of Adam with them.
 
     Args:
-        rows: Gaussians, [N, 16]; changed with ADAM.
+        rows: Gaussians, [N, 16]; changed if ADAM is true.
         view: View, [18]; the module `projection` describes the layout.
         width: Width of the image, pixels.
         height: Height of the image, pixels.
-        visible: Rows that are drawn, [n_visible], ascending; one lane computes one of them.
-        n_visible: Number of these rows.
-        firsts: First row of `sums` of each splat, [N].
-        pairs: Number of rows of `sums` of each splat, one for each of its tiles, [N].
+        visible: Indices of the drawn Gaussians, [n_visible], ascending; each lane computes one.
+        n_visible: Number of drawn Gaussians.
+        firsts: Index of each splat's first row in `sums`, [N].
+        pairs: Number of each splat's rows in `sums`, one row per tile, [N].
         sums: Output of `blend_backward`, [P, 16].
-        by_rows: Output without ADAM, [n_visible, 16]: derivatives with respect to the rows. Column
-            14 is the blending weight summed over the pixels.
-        moments: First moments, [N, 16]; changed with ADAM.
-        squares: Second moments, [N, 16]; changed with ADAM.
-        steps: Number of steps of each row, [N]; changed with ADAM.
-        rates: Learning rates of the columns, [16].
-        corrections: 1 / (1 - beta^steps) of both moments, [LAST_STEP + 1, 2].
+        by_rows: Output if ADAM is false, [n_visible, 16]: derivatives with respect to `rows`.
+            Column 14 is the blending weight summed over the pixels.
+        moments: First moments of Adam, [N, 16]; changed if ADAM is true.
+        squares: Second moments of Adam, [N, 16]; changed if ADAM is true.
+        steps: Number of steps that each Gaussian has taken, [N]; changed if ADAM is true.
+        rates: Learning rates of the columns of `rows`, [16].
+        corrections: Bias corrections 1 / (1 - beta^steps) of first and second moments,
+            [LAST_STEP + 1, 2].
         beta1: Decay of the first moments.
         beta2: Decay of the second moments.
-        epsilon: Positive term that keeps the denominator from zero.
-        needle_weight: Weight of the penalty on needles.
+        epsilon: Positive term that keeps the denominator of the step from zero.
+        needle_weight: Weight of the penalty on needles, which are Gaussians with one long axis.
         needle_log_ratio: Logarithm of the axis ratio above which the penalty applies.
-        max_sigma_per_depth: Maximum standard deviation per meter of depth after the step.
-        weights: Output, [n_visible]: blending weight of each row summed over the pixels.
-        by_pose: Output, [programs, 8]: derivatives with respect to xi of T_map_camera exp(xi),
-            rotation first, then two zeros; to be summed over the programs.
-        LAST_STEP: Number of steps after which the correction stays constant.
-        ADAM: Take a step of Adam, instead of writing the derivatives.
-        BLOCK: Lanes of a program.
+        max_sigma_per_depth: Maximum standard deviation after the step, as a fraction of the depth.
+        weights: Output, [n_visible]: blending weight of each Gaussian summed over the pixels.
+        by_pose: Output, [programs, 8]: derivatives with respect to xi of T_map_camera exp(xi):
+            rotation (3), translation (3), two zeros. The caller sums them over the programs.
+        LAST_STEP: Number of steps after which the bias correction of Adam stays constant.
+        ADAM: True to take a step of Adam, false to write the derivatives.
+        BLOCK: Number of lanes of a Triton program.
     """
     lane = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     is_live = lane < n_visible

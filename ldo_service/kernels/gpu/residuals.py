@@ -3,12 +3,13 @@
 A point has 7 floats: coordinates 0-2, gray level 3, normal 4-6. A texel has 4 floats: gray level,
 its derivatives along u and v, depth. `tracking.alignment` describes residuals and weights.
 
-A problem has 25 floats: T_camera_reference row by row (12), fx fy cx cy, gain, bias, the noise of
-gray levels, a factor on the noise of depth, its floor, growth and nearest depth, gate, occlusion.
+A problem has 25 floats: T_camera_reference row by row (12), fx fy cx cy (4), gain, bias, standard
+deviation of gray levels, factor on the depth noise, the parameters floor, growth and nearest of
+`DepthNoise` (3), and the settings gate and occlusion of `ResidualConfig` (2).
 
-The order of the sums is: upper triangle of the Hessian row by row (36), gradient (8), number of
-visible points. Number, inliers and sum of weighted squares of the photometric residuals follow,
-and the same of the geometric residuals.
+The 51 sums are, in this order: upper triangle of the Hessian row by row (36), gradient (8), number
+of visible points (1), and three sums for each kind of residual, photometric first: number of
+residuals, number of inliers, sum of weighted squares.
 """
 
 import triton
@@ -26,7 +27,10 @@ ROWS = tl.constexpr(14)  # Sums of a strip: photometric gradient (8), geometric 
 
 @triton.jit
 def bilinear(upper, below, k, du, dv, inside):
-    """Return value k of the texels between four pixels; `below` is the size of a row."""
+    """Return value k of the texels, interpolated between four pixels, and the minimum of the four.
+
+    `upper` is the address of the upper left texel, and `below` is the number of floats in a row.
+    """
     a, b = tl.load(upper + k, inside, 0.0), tl.load(upper + TEXEL + k, inside, 0.0)
     c, d = tl.load(upper + below + k, inside, 0.0), tl.load(upper + below + TEXEL + k, inside, 0.0)
     top, bottom = a + du * (b - a), c + du * (d - c)
@@ -36,7 +40,10 @@ def bilinear(upper, below, k, du, dv, inside):
 
 @triton.jit
 def robust_scale(r, inverse_sigma, used):
-    """Return sqrt(w) / sigma, (r / sigma)^2 and the weight w of residuals; 0 if not used."""
+    """Return sqrt(w) / sigma, (r / sigma)^2 and the robust weight w of residuals r.
+
+    sqrt(w) / sigma is 0 for residuals that are not used.
+    """
     normalized = r * inverse_sigma
     square = normalized * normalized
     weight = tl.div_rn(DEGREES_OF_FREEDOM + 1.0, square + DEGREES_OF_FREEDOM)
@@ -57,7 +64,7 @@ def store_statistics(out, k, n_programs, used, square, weight):
 
 @triton.jit
 def store_strips(strips, k, n, values, BLOCK: tl.constexpr):
-    """Store row k of the sums over strips."""
+    """Sum `values` over each strip of 16 consecutive points, and store row k of `strips`."""
     n_strips = (n + STRIP - 1) // STRIP
     strip = tl.program_id(0) * (BLOCK // STRIP) + tl.arange(0, BLOCK // STRIP)
     sums = tl.sum(tl.reshape(values, [BLOCK // STRIP, STRIP]), 1)
@@ -66,9 +73,10 @@ def store_strips(strips, k, n, values, BLOCK: tl.constexpr):
 
 @triton.jit
 def project_points(points, i, live, n, R0, R1, R2, t, lens, width, height):
-    """Return the points in the camera, their pixels, and which of them lie inside the image.
+    """Return the points in the camera frame, their pixels, and whether they lie in the image.
 
-    Points outside become (0, 0, 1) and pixel (0, 0), so that they are finite.
+    Points outside of the image get the coordinates (0, 0, 1) and the pixel (0, 0), so all values
+    are finite.
     """
     fx, fy, cx, cy = lens
     P = (
@@ -89,9 +97,10 @@ def project_points(points, i, live, n, R0, R1, R2, t, lens, width, height):
 
 @triton.jit
 def photometric(p, shade, gray, slope_u, slope_v, used, problem, lens):
-    """Return the rows sqrt(w) / sigma [J | r] of residuals r = gray - gain shade - bias.
+    """Return weighted rows [J | r] of photometric residuals, (r / sigma)^2 and the weights w.
 
-    (r / sigma)^2 and the weights follow. A row that is not used is 0.
+    A residual is r = gray - gain shade - bias, where `shade` is the gray level of the reference
+    point. Each row is multiplied by sqrt(w) / sigma. Rows of unused residuals are 0.
     """
     gain, bias = tl.load(problem + 16), tl.load(problem + 17)
     inverse_sigma = tl.div_rn(1.0, tl.load(problem + 18))
@@ -119,9 +128,11 @@ def photometric(p, shade, gray, slope_u, slope_v, used, problem, lens):
 
 @triton.jit
 def geometric(p, normal, q, used, problem):
-    """Return the rows sqrt(w) / sigma [J | r] of residuals r = normal . (p - q), then as above.
+    """Return weighted rows [J | r] of geometric residuals, (r / sigma)^2 and the weights w.
 
-    The rows have 6 derivatives, because gain and bias have no effect.
+    A residual is r = normal . (p - q), where q is the measured point. Each row is multiplied by
+    sqrt(w) / sigma. J has 6 columns, because gain and bias have no effect. Rows of unused residuals
+    are 0.
     """
     noise_scale, floor = tl.load(problem + 19), tl.load(problem + 20)
     growth, nearest = tl.load(problem + 21), tl.load(problem + 22)
@@ -161,21 +172,23 @@ def sum_residuals(
     WITH_STRIPS: tl.constexpr,
     BLOCK: tl.constexpr,
 ):
-    """Compute the residuals of BLOCK points, and the program's sums of their normal equations.
+    """Compute the residuals of BLOCK points, and sum their normal equations.
+
+    The module describes the layouts of points, texels, problem and sums.
 
     Args:
-        points: [7, n].
+        points: Reference points, [7, n].
         n: Number of points.
-        texels: [height, width, 4].
+        texels: Image and depth of the frame, [height, width, 4].
         width: Width of the image, pixels.
         height: Height of the image, pixels.
-        problem: [25].
-        n_programs: Number of programs.
-        out: Output, [51, n_programs].
-        strips: Output with WITH_STRIPS, [14, ceil(n / 16)]: gradients of each strip, the
-            photometric ones first.
-        WITH_STRIPS: Whether `strips` is written.
-        BLOCK: Points of a program, a multiple of 16.
+        problem: Pose, camera and settings, [25].
+        n_programs: Number of Triton programs.
+        out: Output, [51, n_programs]: sums of each program.
+        strips: Output if WITH_STRIPS is true, [14, ceil(n / 16)]: photometric gradient (8), then
+            geometric gradient (6), of each strip of 16 consecutive points.
+        WITH_STRIPS: True to write `strips`.
+        BLOCK: Number of points of a Triton program, a multiple of 16.
     """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     live = i < n
@@ -241,13 +254,13 @@ def sum_residuals(
 
 @kernel
 def add_programs(sums, n, out, LANES: tl.constexpr):
-    """Add the sums of all programs in double precision, one row per program.
+    """Add up each row of `sums` in double precision.
 
     Args:
-        sums: [rows, n].
-        n: Number of programs that computed the sums.
+        sums: Sums of `sum_residuals`, [rows, n]; each Triton program wrote one column.
+        n: Number of columns.
         out: Output, [rows] float64.
-        LANES: Number of values that are added to as many partial sums at once.
+        LANES: Number of partial sums that are computed in parallel.
     """
     row, lane = tl.program_id(0), tl.arange(0, LANES)
     total = tl.zeros([LANES], tl.float64)
@@ -258,14 +271,14 @@ def add_programs(sums, n, out, LANES: tl.constexpr):
 
 @kernel
 def add_strips(strips, cells, n, out, LANES: tl.constexpr):
-    """Add the gradients of all strips of a cell in double precision, one cell per program.
+    """Add up the gradients of all strips of each image cell in double precision.
 
     Args:
-        strips: [14, n].
-        cells: Number of the cell of each strip, [n] uint8.
+        strips: Gradients of `sum_residuals`, [14, n]: photometric (8), then geometric (6).
+        cells: Number of the image cell of each strip, [n] uint8.
         n: Number of strips.
-        out: Output, [64, 14] float64.
-        LANES: Number of strips that are added to as many partial sums at once.
+        out: Output, [64, 14] float64: one row per image cell.
+        LANES: Number of partial sums that are computed in parallel.
     """
     cell = tl.program_id(0)
     row, lane = tl.arange(0, 16), tl.arange(0, LANES)

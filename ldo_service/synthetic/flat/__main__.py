@@ -1,6 +1,6 @@
 """Command that renders a whole sequence into the cache and prints its statistics.
 
-    python -m ldo_service.synthetic.flat [flat | flat-exact | ...] [PROCESSES]
+    python -m ldo_service.synthetic.flat [flat | flat-exact | ...] [number of processes]
 
 The statistics show how hard the sequence is: motion, bare walls, missing depth and the number of
 visible objects per class.
@@ -46,7 +46,7 @@ def motion(T_world_camera: np.ndarray) -> MotionSpeeds:
     """Return the speeds and turn rates of a trajectory.
 
     Args:
-        T_world_camera: Camera poses [N, 4, 4], RATE_HZ of them per second.
+        T_world_camera: Camera poses [N, 4, 4] at RATE_HZ poses per second.
     """
     steps_m = np.diff(T_world_camera[:, :3, 3], axis=0)
     before, after = T_world_camera[:-1, :3, :3], T_world_camera[1:, :3, :3]
@@ -56,7 +56,7 @@ def motion(T_world_camera: np.ndarray) -> MotionSpeeds:
 
 
 def contents(sequence: FlatSequence, stride: int = 1) -> Contents:
-    """Return the statistics of every `stride`-th frame."""
+    """Return the label and depth statistics, computed from every `stride`-th frame."""
     seen, walls, missing = set(), [], []
     for index in range(0, len(sequence), stride):
         labels = sequence.labels(index)
@@ -69,7 +69,7 @@ def contents(sequence: FlatSequence, stride: int = 1) -> Contents:
 
 
 def main() -> None:
-    """Run the command."""
+    """Render the sequence and print its statistics."""
     name = sys.argv[1] if len(sys.argv) > 1 else "flat"
     processes = int(sys.argv[2]) if len(sys.argv) > 2 else os.cpu_count() or 1
     sequence = FlatSequence.named(name)

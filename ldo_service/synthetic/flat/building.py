@@ -107,7 +107,7 @@ def level(
 ) -> list[Panel]:
     """Return the floor and the ceiling of a room.
 
-    If `size_m` reaches the outer faces of the walls, the floor also covers the doorways.
+    The floor also covers the doorways if `size_m` includes the thickness of the walls.
     """
     below = placed(Solid("box", (*center_m, -0.05), (*size_m, 0.1), floor))
     above = placed(Solid("box", (*center_m, HEIGHT_M + 0.05), (*size_m, 0.1), "ceiling"))

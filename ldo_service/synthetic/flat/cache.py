@@ -48,8 +48,8 @@ def cache_root() -> Path:
 class FrameCache:
     """Disk cache of the frames of one sequence.
 
-    The cache deletes the oldest sequences when all of them together exceed LIMIT_BYTES. A cache
-    that cannot be written is not an error: frames are then rendered at each read.
+    The cache deletes the oldest sequences when the cached sequences exceed LIMIT_BYTES in total. If
+    the cache cannot be written, frames are rendered at each read.
     """
 
     def __init__(self, identity: str, width: int, height: int) -> None:
@@ -129,7 +129,7 @@ class FrameCache:
         body = data[_HEADER.size :]
         if len(body) != sum(lengths) or _digest(body) != digest:
             raise FrameError(
-                f"its {len(data)} bytes do not match the length or digest in its header"
+                f"the {len(data)} bytes do not match the length or digest in the header of the file"
             )
         parts, start = [], 0
         for length in lengths:

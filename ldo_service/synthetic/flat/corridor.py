@@ -1,11 +1,11 @@
-"""Long corridor with weak texture, equal doors and few objects, and a walk to its end and back.
+"""Long corridor with few features, and a walk to its end and back.
 
 World frame: x along the corridor, y across it toward the wall with the doors, z up; the origin is
 the center of the floor.
 
-A shift along x by the length of a section maps walls, floor, ceiling and doors onto themselves.
-Only the objects of `OBJECTS` tell where along the corridor the camera is. The way back shows the
-doors and the objects from the other side.
+The corridor has 8 sections with weak texture and one door each. A shift along x by the
+length of a section maps walls, floor, ceiling and doors onto themselves. Only the objects of
+`OBJECTS` differ between the sections. The way back shows the doors and objects from the other side.
 """
 
 import numpy as np
@@ -57,7 +57,7 @@ def section_x_m(number: int) -> float:
 def furnished_corridor(seed: int) -> Flat:
     """Return the corridor; `seed` determines its textures and materials.
 
-    Its sections are the rooms 0 to 7.
+    Each of its sections counts as a room; the room numbers are 0 to 7.
     """
     paint = Materials(np.random.default_rng([seed, 0]))
     equal = built(EQUAL, paint)
@@ -94,7 +94,10 @@ def _panels(number: int) -> list[Panel]:
 
 
 def knots() -> np.ndarray:
-    """Return the knots of the walk, [K, 6]: camera center x, y, z in meters, viewing direction."""
+    """Return the knots of the walk in the world frame, [K, 6].
+
+    The columns are the camera center x, y, z in meters and the viewing direction x, y, z.
+    """
     mirror = np.array([-1, 1, 1, -1, 1, 1])
     there_m = np.arange(-_END_M + PITCH_M / 2, _END_M, PITCH_M)
     there = [[-_END_M, *_TURNING], *([x_m, *_ALONG] for x_m in there_m)]

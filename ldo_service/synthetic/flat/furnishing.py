@@ -1,6 +1,6 @@
 """Furniture of the flat: one row per object with class, shape number, position and heading.
 
-Positions, in meters, and headings are in the frame of the room.
+Positions (meters) and headings are in the frame of the room.
 """
 
 import numpy as np
@@ -153,7 +153,7 @@ def things(seed: int) -> tuple[tuple[SceneObject, int], ...]:
 
 
 def built(rows: tuple[Row, ...], paint: Materials) -> list[SceneObject]:
-    """Build the objects that the rows list, in the frame of their room."""
+    """Build the objects that the rows of a table describe, in the frame of their room."""
     made = [(label, CATALOG[label](paint, shape), at, way) for label, shape, at, way in rows]
     return [
         SceneObject(label, tuple(Placement(at, way)(solid) for solid in solids))

@@ -136,7 +136,7 @@ class FlatRenderer:
 
         Args:
             camera: Intrinsics.
-            T_world_camera: Camera pose [4, 4], or one for each row, [H, 4, 4].
+            T_world_camera: Camera pose [4, 4], or one pose for each image row, [H, 4, 4].
         """
         v, u = np.divmod(np.arange(camera.width * camera.height), camera.width)
         view = RayCaster(self._flat.shell, self._table.solids, camera, T_world_camera)

@@ -53,7 +53,7 @@ class Placement:
 
 @dataclass(frozen=True, slots=True)
 class SceneObject:
-    """Class name and solids of one object, all in one frame: its own, its room's or the world."""
+    """Class name and solids of one object, in the frame of the object, its room or the world."""
 
     label: str
     solids: tuple[Solid, ...]

@@ -39,9 +39,9 @@ class Sensor:
     def color(self, frame: int, rendering: FlatRendering, rng: np.random.Generator) -> np.ndarray:
         """Return the light [H, W, 3] that the camera records, with motion blur, gain and noise.
 
-        Motion during the exposure is approximated as linear: a pixel averages the sharp image along
-        the image path of the surface point it shows. Surfaces that the motion uncovers are not
-        modeled. Full scale is 1; values are not clipped.
+        Motion during the exposure is approximated as linear. Each pixel is the mean of the sharp
+        image along the path of its surface point through the image. Surfaces that the motion
+        uncovers are not modeled. Full scale is 1; values are not clipped.
         """
         gain = 1 + EXPOSURE_SPREAD * self._drift(frame)
         blurred = blur(rendering.light, *self.motion_px(frame, rendering.depth_m))
@@ -74,9 +74,9 @@ def measured_depth_m(
 ) -> np.ndarray:
     """Return depth with the errors of a Kinect-like camera.
 
-    The depth has steps of 2.85e-3 z^2 for z in meters (Khoshelham and Elberink, Sensors 2012). It
-    has ragged edges and noise of half a step; neighboring pixels have similar noise. There is no
-    measurement in the projector's shadow, on dark patches and outside 0.4-5 m.
+    At a depth of z meters, the depth has steps of 2.85e-3 z^2 meters (Khoshelham and Elberink,
+    Sensors 2012). It has ragged edges and noise of half a step; neighboring pixels have similar
+    noise. Depth is unknown in the projector's shadow, on dark patches and outside 0.4 to 5 m.
 
     Args:
         exact_m: Exact depth [H, W], meters.
@@ -96,10 +96,10 @@ def measured_depth_m(
 
 
 def normal(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """Return nearly normal numbers of unit variance, bitwise equal on every machine.
+    """Return random numbers of zero mean and unit variance, bitwise equal on every machine.
 
-    Each number is a sum of three uniform numbers. Exact normal numbers need logarithms, whose bits
-    differ between machines.
+    Each number is a scaled sum of three uniform numbers, so the distribution is nearly normal.
+    Exact normal numbers need logarithms, and the bits of logarithms differ between machines.
     """
     total = rng.random(shape) + rng.random(shape) + rng.random(shape)  # Variance 3 / 12.
     return 2 * (total - 1.5)
@@ -110,8 +110,8 @@ def blur(light: np.ndarray, du_px: np.ndarray, dv_px: np.ndarray) -> np.ndarray:
 
     Args:
         light: Image [H, W, 3].
-        du_px: Extent [H, W] of the line in u.
-        dv_px: Extent [H, W] of the line in v.
+        du_px: Extent [H, W] of the line in u, pixels.
+        dv_px: Extent [H, W] of the line in v, pixels.
     """
     v, u = np.mgrid[: light.shape[0], : light.shape[1]]
     total = np.zeros(light.shape)
@@ -153,7 +153,7 @@ def _ragged(depth_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def is_too_dark(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return a random mask [H, W] of the pixels that are too dark to be measured.
 
-    Holes have the size PATCH_PX. The darker a surface is, the more of its pixels are masked.
+    The masked patches are about PATCH_PX pixels wide. Darker surfaces have more masked pixels.
     """
     brightness = (light[..., 0] + light[..., 1] + light[..., 2]) / 3
     patches = _enlarged(rng.random(_coarse(brightness.shape, PATCH_PX)), PATCH_PX, brightness.shape)

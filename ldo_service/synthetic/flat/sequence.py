@@ -52,7 +52,7 @@ LONG_WIDTH_PX, LONG_HEIGHT_PX = 320, 240
 
 @dataclass(frozen=True, slots=True)
 class FlatConfig:
-    """Parameters of a rendered sequence; equal values give equal bytes."""
+    """Parameters of a rendered sequence; equal parameters give bitwise equal images."""
 
     width_px: int = 640
     height_px: int = 480
@@ -66,7 +66,7 @@ class FlatConfig:
         if self.width_px < 16 or self.height_px < 16:
             raise ConfigError(
                 f"images of synthetic:{self.scene} have {self.width_px}x{self.height_px} pixels, "
-                "must have at least 16x16 pixels."
+                "but must have at least 16x16 pixels."
             )
         if self.seed < 0:
             raise ConfigError(f"synthetic:{self.scene}: seed={self.seed} must be at least 0.")
@@ -140,7 +140,7 @@ class FlatSequence(Sequence):
         return FrameLabels(frame.class_ids, frame.instance_ids)
 
     def true_labels(self) -> TrueLabels:
-        """Return the class names, and a function that returns the true labels of a frame."""
+        """Return the class names, and a function that returns a frame's ground-truth labels."""
         return TrueLabels(CLASS_NAMES, self.labels)
 
     def truth(self) -> Trajectory:
@@ -177,7 +177,7 @@ def prerender(
 ) -> None:
     """Render all frames that are missing in the cache, in several processes.
 
-    A frame of 640x480 pixels takes a process about one second.
+    One process needs about one second for a frame of 640x480 pixels.
 
     Args:
         config: Parameters of the sequence.

@@ -1,12 +1,12 @@
-"""Four equal offices along a corridor of four equal sections, which differ in their objects.
+"""Four offices that look alike, along a corridor of four sections that look alike.
 
 World frame: x along the corridor, y across the corridor toward the offices, z up; the origin is the
 center of the corridor's floor.
 
 A shift along x by the width of an office maps the building onto itself, except for its two ends.
-It also maps the furniture that all offices and all sections have, and the textures of everything.
-Only the objects of `OFFICE_OBJECTS` and `SECTION_OBJECTS` differ. Geometry and most of the
-appearance therefore fit at each office equally well.
+The same holds for the textures and for the furniture that all offices or all sections have. Only
+the objects of `OFFICE_OBJECTS` and `SECTION_OBJECTS` differ. Geometry and most of the appearance
+of a view therefore fit every office equally well.
 """
 
 import numpy as np

@@ -1,6 +1,6 @@
-"""Walk along equal offices, which returns to some after it has seen others that look the same.
+"""Walk past four offices that look alike, with returns to offices that it has visited before.
 
-The order of the visits is 0, 2, 1, 3, 2, 1, 0; the last three return to a known office.
+The offices are visited in the order 0, 2, 1, 3, 2, 1, 0. The last three visits are returns.
 """
 
 import numpy as np
@@ -50,7 +50,10 @@ PASSED = np.array([0.0, -0.2, 1.46, 0.87, 0.48, -0.10])
 
 
 def knots() -> np.ndarray:
-    """Return the knots of the walk, [K, 6]: camera center x, y, z in meters, viewing direction."""
+    """Return the knots of the walk in the world frame, [K, 6].
+
+    The columns are the camera center x, y, z in meters and the viewing direction x, y, z.
+    """
     rows = []
     for office, direction, visited in STATIONS:
         there = VISIT if visited else PASSED[None]

@@ -1,6 +1,7 @@
-"""Walk of a hand-held camera on a closed path, and its path through the flat.
+"""Walk of a hand-held camera on a closed path.
 
-It visits each room of the flat twice and passes the corridor in between.
+The default path leads through the flat. It visits each of the two rooms twice and passes the
+corridor between the rooms.
 """
 
 from dataclasses import dataclass
@@ -67,7 +68,7 @@ TREMOR_S, TREMOR_EYE_M, TREMOR_GAZE = 0.2, 0.0015, 0.004
 
 @dataclass(frozen=True, slots=True)
 class CameraPath:
-    """Motion along a closed camera path; one turn takes `frames` frames."""
+    """Motion along a closed camera path; one round takes `frames` frames."""
 
     # Knots of a closed spline in the world frame, [K, 6]: camera center x, y, z in meters, and
     # viewing direction.
@@ -80,7 +81,7 @@ class CameraPath:
     shakes: tuple[np.ndarray, ...]
 
     def pose(self, frame: float) -> np.ndarray:
-        """Return T_world_camera [4, 4] at the time `frame`, in frames; fractions are allowed."""
+        """Return T_world_camera [4, 4] at frame index `frame`, which may be fractional."""
         turn = frame / self.frames % 1.0
         x = turn * (len(self.along) - 1)
         cell = int(x)
@@ -100,8 +101,8 @@ def hand_held(
         seed: Seed of sway and tremor.
         knots: Camera center in meters and viewing direction along the closed path, [K, 6].
         frames: Number of frames of the walk.
-        walk_m_s: Speed of walking. Only its ratio to the speed of turning, TURN_RAD_S, matters,
-            because the walk is scaled to its number of frames.
+        walk_m_s: Speed of walking, m/s. Only the ratio to the speed of turning, TURN_RAD_S,
+            matters, because the walk always takes `frames` frames.
     """
     rng = np.random.default_rng([seed, 2])
     sway = _shake(rng, frames, SWAY_S, SWAY_EYE_M, SWAY_GAZE)
@@ -119,16 +120,16 @@ def _shake(
 def timed_positions(knots: np.ndarray = KNOTS, walk_m_s: float = WALK_M_S) -> np.ndarray:
     """Return positions on the closed spline through K knots at equal steps of time.
 
-    The walk is divided into 64 K steps of equal duration. Parts that are long or have a large turn
-    take more of them, according to walk_m_s and TURN_RAD_S. The sequence scales the walk to its own
-    duration.
+    The walk is divided into 64 * K steps of equal duration. The camera spends more steps on parts
+    that are long or have a large turn. Only the ratio of walk_m_s to TURN_RAD_S matters, because
+    the sequence scales the walk to the duration of the sequence.
 
     Args:
         knots: Camera center x, y, z in meters and viewing direction of each knot, [K, 6].
-        walk_m_s: Speed of walking.
+        walk_m_s: Speed of walking, m/s.
 
     Returns:
-        Spline parameters in knots, [64 K + 1]: 1.5 is halfway from knot 1 to knot 2.
+        Spline parameters [64 * K + 1] in knots; 1.5 is halfway from knot 1 to knot 2.
     """
     place = np.arange(len(knots) * STEPS_PER_KNOT + 1) / STEPS_PER_KNOT
     state = closed_spline(knots, place[:-1])

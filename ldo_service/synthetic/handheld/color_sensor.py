@@ -33,7 +33,7 @@ def vignetting(camera: Camera) -> np.ndarray:
 
 
 def automatic_gains(means: np.ndarray) -> np.ndarray:
-    """Return the channel gains [3] that exposure and white balance control reach after N frames.
+    """Return the channel gains [3] that exposure and white balance have after N frames.
 
     Args:
         means: Mean light of each channel in each frame, [N, 3], oldest first; N is at least 1.
@@ -52,7 +52,7 @@ def automatic_gains(means: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class RowPoses:
-    """Poses T_world_camera of all image rows, each [H, 4, 4], at three times of the exposure."""
+    """Poses T_world_camera of all H image rows at three times of the exposure, each [H, 4, 4]."""
 
     opened: np.ndarray  # Poses at the start of the exposure.
     middle: np.ndarray  # Poses at the middle of the exposure.
@@ -62,8 +62,8 @@ class RowPoses:
 def blurred(light: np.ndarray, depth_m: np.ndarray, camera: Camera, rows: RowPoses) -> np.ndarray:
     """Return the light [H, W, 3] averaged over the exposure of each row.
 
-    A pixel averages the sharp image along the image path of the surface point it shows. Surfaces
-    that the motion uncovers are not modeled.
+    Each pixel is the mean of the sharp image along the path of its surface point through the image.
+    Surfaces that the motion uncovers are not modeled.
     """
     return blur(light, *exposure_motion_px(depth_m, camera, rows))
 
@@ -80,18 +80,18 @@ def exposure_motion_px(
 def projected_px(
     depth_m: np.ndarray, camera: Camera, T_world_camera: np.ndarray, T_world_other: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Project the surface point of each pixel into the image at another pose of the pixel's row.
+    """Project the surface point of each pixel into a second view of the same image row.
 
-    The projection ignores lens distortion, because only differences of pixels are used.
+    The projection ignores lens distortion, because callers use only coordinate differences.
 
     Args:
-        depth_m: Depth [H, W], meters.
-        camera: Intrinsics.
-        T_world_camera: Poses [H, 4, 4] of the rows of depth_m.
-        T_world_other: Poses [H, 4, 4] that the rows are projected into.
+        depth_m: Depth [H, W] of the first view, meters.
+        camera: Intrinsics of both views.
+        T_world_camera: Poses [H, 4, 4] of the rows of the first view.
+        T_world_other: Poses [H, 4, 4] of the rows of the second view.
 
     Returns:
-        Pixel coordinates u and v, each [H, W].
+        Pixel coordinates u and v in the second view, each [H, W].
     """
     v, u = np.mgrid[: camera.height, : camera.width].astype(np.float64)
     x, y = undistorted(camera, u, v)

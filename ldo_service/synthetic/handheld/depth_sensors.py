@@ -33,9 +33,10 @@ STEREO_NEAREST_M, STEREO_FARTHEST_M = 0.3, 8.0
 class DepthBias:
     """Smooth error of inverse depth, 1 / z' = 1 / z + c20 x^2 + c11 x y + c02 y^2.
 
-    x and y are the offset of a pixel from the image center, in half image widths. The sizes of the
-    coefficients are those of the ASUS Xtion that recorded `crowd` of Bonn RGB-D Dynamic. At a depth
-    of 3 m, the error of that camera at the sides of the image is 70 to 210 mm.
+    z is the depth without the bias and z' the depth with the bias. x and y are the offset of a
+    pixel from the image center, in half image widths. The coefficients are as large as those of the
+    ASUS Xtion that recorded the sequence `crowd` of Bonn RGB-D Dynamic. At a depth of 3 m, that
+    camera has errors of 70 to 210 mm at the sides of the image.
     """
 
     c20_per_m: float

@@ -31,9 +31,9 @@ def parse_effects(text: str, name: str) -> Effects:
     """Return the effects that are listed after `-handheld`, such as `:blur+tof`.
 
     Args:
-        text: Empty for all effects with a Kinect, or a colon and names joined by `+`. `all` and
-            `none` are names too, and `all` includes `kinect`. Of several depth cameras, the last
-            one is used.
+        text: A colon and names joined by `+`. The names `all` and `none` are allowed; `all`
+            includes the depth camera `kinect`. If the text names several depth cameras, the last
+            one applies. Empty text means `:all`.
         name: Name of the sequence, for the error message.
 
     Raises:

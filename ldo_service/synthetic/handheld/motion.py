@@ -15,7 +15,7 @@ TREMOR_S, TREMOR_EYE_M, TREMOR_RAD = 0.2, 0.002, 0.008
 
 @dataclass(frozen=True, slots=True)
 class HandMotion:
-    """Motion along a closed camera path; one turn takes `duration_s`."""
+    """Motion along a closed camera path; one round takes `duration_s`."""
 
     # Knots of a closed spline in the world frame, [M, 6]: camera center x, y, z in meters, and
     # viewing direction.

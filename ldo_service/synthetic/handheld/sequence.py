@@ -55,15 +55,15 @@ class ExactImages:
 
 
 class Scene(Protocol):
-    """Scene that is rendered from one pose, or from one pose for each row."""
+    """Scene that a camera image can be rendered from."""
 
     def render(self, camera: Camera, T_world_camera: np.ndarray, time_s: float) -> ExactImages:
         """Render the scene.
 
         Args:
             camera: Intrinsics.
-            T_world_camera: Camera pose [4, 4], or one for each row, [H, 4, 4].
-            time_s: Time since the first frame, which determines where moving objects are.
+            T_world_camera: Camera pose [4, 4], or one pose for each image row, [H, 4, 4].
+            time_s: Time since the first frame; it determines the positions of moving objects.
         """
         ...
 
@@ -127,7 +127,7 @@ NAMED = tuple(f"{name}{MARK}" for name in WALKS)
 
 @dataclass(frozen=True, slots=True)
 class HandheldConfig:
-    """Parameters of a simulated sequence; equal values give equal bytes."""
+    """Parameters of a simulated sequence; equal parameters give bitwise equal images."""
 
     walk: str = "room"  # Scene and motion, a key of WALKS.
     effects: Effects = field(default_factory=Effects)  # Effects of real cameras to simulate.
@@ -184,7 +184,7 @@ class HandheldSequence(Sequence):
 
     # --- truth --------------------------------------------------------------------------------
     def truth(self) -> Trajectory:
-        """Return the ground-truth trajectory, at the middle row of each color image."""
+        """Return the ground-truth trajectory: the pose of the middle row of each color image."""
         times_s = self.stamps_ns / 1e9
         return Trajectory(times_s, self._motion.poses(times_s))
 
@@ -203,7 +203,7 @@ class HandheldSequence(Sequence):
         """Return T_world_camera [H, 4, 4] for the time at which each row of depth is measured.
 
         Simulated time-of-flight and stereo cameras measure all rows at the same time. Exact depth
-        and that of a Kinect v1 are measured row by row, like the color image.
+        and Kinect v1 depth are measured row by row, like the color image.
         """
         if self.config.effects.depth in ("tof", "stereo"):
             time_s = np.full(HEIGHT_PX, self._time_s(index) + self.depth_delay_s)
@@ -228,7 +228,7 @@ class HandheldSequence(Sequence):
         return RawFrame(index, stamp_ns, frame.color, frame.depth_m, 1.0, self.raw_camera)
 
     def true_labels(self) -> TrueLabels | None:
-        """Return the labels of the flat; None for the room."""
+        """Return the ground-truth labels if the scene is the flat; None if it is the room."""
         return TrueLabels(CLASS_NAMES, self._labels) if self.config.walk == "flat" else None
 
     @cached_property
@@ -239,8 +239,8 @@ class HandheldSequence(Sequence):
     def exact(self, index: int, T_world_camera: np.ndarray) -> ExactImages:
         """Return the images that a perfect camera would record from given row poses.
 
-        Moving objects are at their positions at the stamp of the frame, even in rows and depth
-        images that are recorded earlier or later.
+        All rows show moving objects at their positions at the stamp of the frame, although the
+        rows and the depth image are recorded earlier or later.
 
         Args:
             index: Index of the frame.

@@ -43,7 +43,7 @@ def test_missing_gpu_is_an_error(torch: SimpleNamespace) -> None:
 
 def test_old_gpu_is_an_error(torch: SimpleNamespace) -> None:
     torch.cuda.get_device_capability = lambda _: (6, 1)
-    with pytest.raises(DeviceError, match=r"capability 6.1, and the kernels need 7.5"):
+    with pytest.raises(DeviceError, match=r"capability 6.1, but the kernels need at least 7.5"):
         find_gpu()
 
 

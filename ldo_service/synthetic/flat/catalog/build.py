@@ -20,17 +20,17 @@ def solid(
 
 
 def box(foot_m: Triple, size_m: Triple, paint: str, heading: Heading = (1.0, 0.0)) -> Solid:
-    """Return a box on `foot_m`."""
+    """Return a box with the center of its underside at `foot_m`."""
     return solid("box", foot_m, size_m, paint, heading)
 
 
 def ball(foot_m: Triple, size_m: Triple, paint: str) -> Solid:
-    """Return an ellipsoid on `foot_m`."""
+    """Return an ellipsoid with the center of its underside at `foot_m`."""
     return solid("ball", foot_m, size_m, paint)
 
 
 def cylinder(foot_m: Triple, width_m: float, height_m: float, paint: str) -> Solid:
-    """Return an upright cylinder on `foot_m`."""
+    """Return an upright cylinder with the center of its underside at `foot_m`."""
     return solid("cylinder", foot_m, (width_m, width_m, height_m), paint)
 
 

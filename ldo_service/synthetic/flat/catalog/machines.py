@@ -6,7 +6,7 @@ from .build import Builder, Solids, ball, box, cylinder, legs, solid
 
 
 def tv(paint: Materials, shape: int) -> Solids:
-    """Build a TV: shape 0 stands on a foot, 1 is smaller and for the wall."""
+    """Build a TV: shape 0 stands on a foot, shape 1 is smaller and is mounted on a wall."""
     case, width = paint("plastic"), 1.0 if shape == 0 else 0.8
     height = 0.56 * width
     z = 0.06 if shape == 0 else 0.0
@@ -73,7 +73,7 @@ def toilet(paint: Materials, _: int) -> Solids:
 
 
 def speaker(paint: Materials, shape: int) -> Solids:
-    """Build a speaker: shape 0 is a tower, 1 is a small one for a shelf."""
+    """Build a speaker: shape 0 is a tower, shape 1 is a small shelf speaker."""
     case, cone = paint("wood"), paint("screen")
     height, width = (0.8, 0.22) if shape == 0 else (0.3, 0.18)
     at = [(0.3 * height, 0.16), (0.68 * height, 0.12)]

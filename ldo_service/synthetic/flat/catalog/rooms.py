@@ -66,7 +66,7 @@ def chair(paint: Materials, shape: int) -> Solids:
 
 
 def couch(paint: Materials, shape: int) -> Solids:
-    """Build a couch of two seats: shape 0 has arms, 1 is longer and has none."""
+    """Build a couch of two seats: shape 0 has arms, shape 1 is longer and has no arms."""
     cover, seat = paint("fabric"), paint("fabric")
     width = 1.5 if shape == 0 else 1.8
     body = box((0, 0, 0.08), (width, 0.8, 0.3), cover)
