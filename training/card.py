@@ -229,7 +229,8 @@ boxes with a score of at least 0.25.
 |---|---|---|---|---|---|---|---|---|
 {detected}
 
-Fraction of crops that get their correct name, by true name. The encoder chooses from all names.
+Each row gives the fraction of the crops of one name that the encoder names correctly. The encoder
+chooses from all names.
 
 | | rooms | flat |
 |---|---|---|

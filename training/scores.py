@@ -170,7 +170,7 @@ class Naming:
     confidence: np.ndarray  # Softmax probabilities [N] of the predicted names.
 
     def accuracy(self, names: Iterable[str] = encoder.NAMES) -> float:
-        """Return the fraction of correct predictions among crops with a true name in `names`."""
+        """Return the fraction of correct predictions among crops whose true name is in `names`."""
         mine = np.isin(self.truth, [encoder.NAMES.index(name) for name in names])
         return float(np.mean(self.told[mine] == self.truth[mine])) if mine.any() else float("nan")
 
