@@ -1,8 +1,8 @@
 """Example of a separate package that adds a layout of recordings to `ldo run`.
 
-The recording is a file .npz with the arrays color [N, H, W, 3] uint8 and depth_mm [N, H, W] uint16,
-stamps_ns [N] int64, and camera [6]: width, height, fx, fy, cx, cy. The package registers LAYOUT in
-its pyproject.toml:
+The recording is a .npz file with four arrays: color [N, H, W, 3] uint8, depth_mm [N, H, W] uint16,
+stamps_ns [N] int64 and camera [6]. The array camera has width, height, fx, fy, cx and cy. The
+package registers LAYOUT in its pyproject.toml:
 
     [project.entry-points."ldo.sequences"]
     numpy_file = "own_layout:LAYOUT"

@@ -182,7 +182,7 @@ def require_color(image: Image, camera: CameraModel) -> None:
 def require_depth(image: Image, camera: CameraModel, depth_scale: float) -> None:
     """Raise ValueError if the size, encoding or scale of a depth image is invalid.
 
-    The size must be that of the camera, the encoding one for depth, and the scale positive.
+    The image must have the size of the camera and a depth encoding. The scale must be positive.
     """
     require_finite("depth_scale", (depth_scale,))
     if depth_scale <= 0:

@@ -55,8 +55,8 @@ class GraphCorrection(Message, frozen=True, kw_only=True):
         require_count("last_refinement", self.last_refinement)
         if any(not 0 <= older < submap for submap, older in self.merged_submaps):
             raise ValueError(
-                f"merged_submaps is {self.merged_submaps}; each pair must hold the number of a "
-                "merged submap, then the smaller number of an older submap"
+                f"merged_submaps is {self.merged_submaps}; each pair must hold the numbers of a "
+                "merged and an older submap, and the older submap must have the smaller number"
             )
         self.keyframes.require("keyframes", "i8", (None,))
         count = self.keyframes.shape[0]

@@ -46,9 +46,9 @@ class CameraCorrection(msgspec.Struct, frozen=True, kw_only=True):
     correction clips no color.
 
     readout_s, depth_readout_s and depth_delay_s are times of the camera's shutter. They are 0 until
-    the self-calibration has estimated them. Color and depth are then corrected as if the camera had
-    recorded all rows at one instant. This correction needs the motion of the camera, and is skipped
-    for a frame whose motion is unknown.
+    the self-calibration has estimated them. From then on, color and depth are corrected as if the
+    camera had recorded all rows at one instant. This correction needs the motion of the camera, and
+    is skipped for a frame whose motion is unknown.
     """
 
     depth_bias: Terms = NO_TERMS  # b1, b2, b3 in 1/m.

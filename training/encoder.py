@@ -214,7 +214,7 @@ def shown_in(
 def example(
     shown: Shown, before: Shown | None, side_px: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Return an augmented crop of `shown`, occluded by the object of `before` if not None."""
+    """Return an augmented crop of `shown`; the object of `before`, if any, may occlude it."""
     color = recolor(shown.color, shown.plane, rng)
     if before is not None:
         _cover(color, before, rng)

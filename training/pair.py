@@ -86,7 +86,7 @@ def growing(
 
 
 def batches(material: Views, rng: np.random.Generator, side_px: int = INPUT_PX) -> Iterator[tuple]:
-    """Yield batches like `encoder.batches`, but with regions in half of the crops."""
+    """Yield batches like `encoder.batches`, but half of the crops show regions."""
     regions, names = named(material.regions)
     odds, count = _odds(names), round(REGIONS_SHARE * BATCH)
     for crops, told in encoder.batches(material, rng, side_px, BATCH - count):

@@ -43,15 +43,15 @@ def fit_in_rounds(
 ) -> Weights:
     """Fit the weights in consecutive rounds, each with its own warm-up and decay.
 
-    The rate rises again in each round, so that the weights may leave a local minimum and reach a
-    better minimum (Loshchilov and Hutter, SGDR, ICLR 2017).
+    The learning rate rises again in each round, so that the weights may leave a local minimum and
+    reach a better minimum (Loshchilov and Hutter, SGDR, ICLR 2017).
 
     Args:
         loss: Function of weights and a batch.
         weights: Initial weights.
         batches: Batches of each round.
         steps: Steps of each round.
-        rate: Learning rate. Each round uses its fraction of this rate in ROUND_RATES.
+        rate: Learning rate. Each round multiplies this rate by its own factor in ROUND_RATES.
     """
     for source, count, share in zip(batches, steps, ROUND_RATES, strict=True):
         weights = fit(loss, weights, source, count, share * rate)

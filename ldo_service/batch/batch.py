@@ -44,7 +44,7 @@ class Batch:
         executor: Executor,
         begun: Callable[[list[BatchJob]], None],
     ) -> Iterator[Outcome]:
-        """Yield the outcome of each recording, those with finished results first.
+        """Yield the outcome of each recording; recordings with finished results come first.
 
         Args:
             sources: Paths or addresses of the recordings, without repetition.

@@ -116,7 +116,7 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
         folder: Folder of the result, relative to the folder of all results.
         status: "done" if this call made the results, and "kept" if an earlier call made them.
             "failed" if the recording could not be read or processed, and "missing" if the batch was
-            interrupted before.
+            interrupted before the recording was processed.
             "duplicate" if another source has the same name and content.
         error: Reason why there are no results, on one line; empty if there are results.
         notes: Warnings of the run and of its evaluation.

@@ -62,7 +62,8 @@ class ResultFolder:
     def finished(self) -> Outcome | None:
         """Return the outcome of the results in the folder, or None if they are not finished.
 
-        Finished results are complete, and were made with the same key as this folder has.
+        Finished results are complete, and their `result.json` has the `key` of this folder. The key
+        is a digest of everything that the results depend on.
 
         Raises:
             DataError: The folder cannot be read.

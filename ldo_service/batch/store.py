@@ -85,7 +85,7 @@ class Store:
             return self.system.isfile(self.path)
 
     def matches(self) -> list["Entry"]:
-        """Return all files and folders that match this path, which is a pattern; sorted."""
+        """Return all files and folders that match this path, a glob pattern, in sorted order."""
         with self._reported("read"):
             found = self.system.glob(self.path, detail=True)
         return self._entries(found.values())

@@ -141,8 +141,8 @@ class CorrectionHistory:
 def read_corrections(folder: Path) -> CorrectionHistory:
     """Return the camera correction with which each keyframe of a finished run was made.
 
-    A keyframe that an older version of LDO-SLAM wrote has no correction. It gets a correction that
-    changes nothing.
+    Older versions of LDO-SLAM did not write corrections. For their keyframes, the result has a
+    correction that changes nothing.
 
     Raises:
         DataError: keyframes.json of the folder cannot be read, or its content is invalid.

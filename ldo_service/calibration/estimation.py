@@ -11,8 +11,9 @@ the middle row of color is therefore displaced. Bias and shutter times are estim
 Otherwise, the distortion by a rolling shutter would be mistaken for depth bias.
 
 Noise: The residual is the difference of two noisy depths. Its derivatives are computed at the mean
-of both depths, because the noise of the mean is independent of the noise of the difference. At one
-of the depths, the noise of a Kinect would shift the coefficient of y^2 by up to 0.01/m.
+of both depths, because the noise of the mean is independent of the noise of the difference. With
+derivatives at one of the depths, the noise of a Kinect would shift the coefficient of y^2 by up to
+0.01/m.
 
 Color: The two views of a pair show one surface point at two pixels. The log ratio of its brightness
 in both views equals the difference of log V at these pixels. V is the vignetting. A change of the
@@ -120,8 +121,9 @@ class Estimate:
         held-out pairs of views with the new estimate, divided by the residual without correction.
 
         - If the ratio is at most its limit in `max_ratios`, the new estimate is used.
-        - If the ratio is larger, but at most `MAX_KEPT_RATIO`, a correction in `before` stays in
-          use. A correction from an earlier run keeps its value; any other takes the new estimate.
+        - If the ratio is larger, but at most `MAX_KEPT_RATIO`, a camera that `before` corrects
+          stays corrected. The correction comes from `before` if `is_known` is True, else from the
+          new estimate.
         - In all other cases, the coefficients are 0: the camera is not corrected.
 
         Args:

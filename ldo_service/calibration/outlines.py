@@ -208,7 +208,7 @@ def extrinsics(
             during these times shifts the outlines too.
 
     Returns:
-        The estimate; None if there are too few points, or if they have no clear maximum.
+        The estimate; None if there are too few points, or if the search finds no clear maximum.
     """
     if sum(map(len, points)) < MIN_OUTLINES:
         return None

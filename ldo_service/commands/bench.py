@@ -30,9 +30,9 @@ class BenchRender:
     """Measure how long one iteration of the Gaussian optimizer takes on this machine.
 
     The scene is synthetic. The times are medians over all repeats, in milliseconds of wall time.
-    The backward pass includes the step of the optimizer Adam. backward_ms is the time of the
-    backward pass without this step, and adam_ms is the time that the step adds. iteration_ms is the
-    time of forward pass, loss, backward pass and step together.
+    Adam updates the Gaussians inside the backward pass. adam_ms is the time that this update adds,
+    and backward_ms is the time of the backward pass without the update. iteration_ms is the time of
+    forward pass, loss, backward pass and update together.
     """
 
     gaussians: Annotated[int, argument(help="Gaussians in view")] = 100_000
@@ -102,8 +102,8 @@ def bench(
 
     Set the environment variable LDO_ISA to avx512, avx2 or baseline to choose the instruction set.
     With --device cuda, the command first compares the results of the GPU with those of the CPU. If
-    they differ, it measures nothing. If they agree, `render` measures an iteration of the optimizer
-    and the alignment of a frame on both devices.
+    they differ, it measures nothing. If they agree, `ldo bench render` measures an iteration of the
+    optimizer and the alignment of a frame on both devices.
 
       ldo bench
       ldo bench --device cuda

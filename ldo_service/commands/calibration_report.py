@@ -98,8 +98,9 @@ def depth_errors_mm(correction: CameraCorrection, camera: Camera, depth_m: float
         depth_m: Measured depth, meters.
 
     Returns:
-        Measured minus corrected depth in mm, [2]: in the top left and the top right corner. Both
-        bottom corners have the error of the opposite top corner. The error in the center is 0.
+        Measured minus corrected depth in mm, [2]: in the top left and the top right corner. Each
+        bottom corner has the error of the diagonally opposite top corner. The error in the center
+        is 0.
     """
     u, v = np.array([0.0, camera.width - 1.0]), np.zeros(2)
     bias = bias_basis(u, v, camera) @ np.array(correction.depth_bias)

@@ -166,7 +166,9 @@ def _apply(tree: dict[str, Any], setting: str) -> None:
 def _put(tree: dict[str, Any], name: str, value: object, shown: str) -> None:
     """Set the value with a dotted name in a tree; `shown` names the setting in an error."""
     if not isinstance(name, str):
-        raise ConfigError(f"the name of a setting is {name!r}, must be text such as section.field.")
+        raise ConfigError(
+            f"the name of a setting is {name!r}, expected a text such as section.field."
+        )
     *sections, last = name.split(".")
     for section in sections:
         tree = tree.setdefault(section, {})

@@ -1,6 +1,6 @@
 """Conversion of the configuration to the parameters of the actors and of the runtime.
 
-This module and `network_parameters` alone define which parameters a setting determines. Some
+This module and `network_parameters` define which parameters each setting determines. Some
 settings determine parameters of several actors. A parameter without a setting keeps the default of
 its class. A comment in that class gives the reason for the default.
 """

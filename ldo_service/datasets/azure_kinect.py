@@ -45,7 +45,7 @@ LOCATION = "CALIBRATION_CameraLocation"
 
 
 class AzureKinectSequence(Sequence):
-    """Recording of an Azure Kinect: color images with the nearest depth image within 20 ms each."""
+    """Azure Kinect recording: each color image gets the nearest depth image within 20 ms."""
 
     registration = "reader"
 

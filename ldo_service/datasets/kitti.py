@@ -99,7 +99,7 @@ class KittiSequence(Sequence):
         return RawFrame(index, stamp_ns, left, depth_m, 1.0, self.raw_camera)
 
     def truth(self) -> Trajectory | None:
-        """Return the ground-truth trajectory of the left camera; None if it has no poses file."""
+        """Return the ground-truth trajectory of the left camera; None without a poses file."""
         folder = self._folder.resolve()
         paths = folder / "poses.txt", folder.parent.parent / "poses" / f"{folder.name}.txt"
         path = next((path for path in paths if path.is_file()), None)

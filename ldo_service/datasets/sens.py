@@ -79,7 +79,7 @@ class SensSequence(RigSequence):
         super().__init__(path.stem, self._header.rig, stamps_ns, options)
 
     def read_images(self, index: int) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return color, depth, and its units per meter; see `RigSequence.read_images`."""
+        """Return color, depth, and the units of depth per meter; see `RigSequence.read_images`."""
         source = f"{self._path}, frame {index}"
         color_size, depth_size = map(int, self._index.sizes[index])
         try:
@@ -197,8 +197,8 @@ def _index(file: BinaryIO, path: Path, frames: int) -> _Index:
     end = path.stat().st_size
     if not 0 < frames <= end // FRAME.size:
         raise DataError(
-            f"{path}: the header announces {frames} frames, but a file of {end} bytes has 1 to "
-            f"{end // FRAME.size} frames. Copy or download the file again."
+            f"{path}: the header announces {frames} frames, but a file of {end} bytes can have "
+            f"1 to {end // FRAME.size} frames. Copy or download the file again."
         )
     poses, stamps_us, offsets, sizes = [], [], [], []
     for k in range(frames):

@@ -147,7 +147,7 @@ def _calibration(folder: Path, color: list[Path]) -> Calibration:
         raise DataError(
             f"the intrinsics of {folder} are missing: it has no camera.json, and its name contains "
             "none of freiburg1, freiburg2, freiburg3 and rgbd_bonn (recordings with published "
-            f"intrinsics). Create {path}, such as {CAMERA_JSON}."
+            f"intrinsics). Create {path} with content such as {CAMERA_JSON}."
         )
     return Calibration(PUBLISHED_CAMERAS[recording[0]], DEPTH_SCALE)
 

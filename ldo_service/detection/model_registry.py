@@ -68,7 +68,7 @@ class Model:
 
     @property
     def file(self) -> Path:
-        """Path of the detector, or of the image encoder of a pair."""
+        """Path of the ONNX file: the detector, or the image encoder of a labeller."""
         return self.folder / FILE
 
     def verify(self) -> None:

@@ -98,7 +98,7 @@ def read_names(path: Path) -> tuple[str, ...]:
         if not is_name(name):
             raise ConfigError(
                 f"line {number} of {path} is not a valid name: write one name of 1 to {LONGEST} "
-                "characters per line; for a detector, in the order of its classes."
+                "characters per line. The names of a detector must be in the order of its classes."
             )
     return names
 
@@ -283,7 +283,8 @@ class LabelSources:
     def undetectable(self) -> np.ndarray | None:
         """Return the labels that only the labeller has given, [256] bool; None if it gave no label.
 
-        The detector does not know these labels and cannot miss an object that has one of them.
+        The detector never detects objects with these labels, so a missing detection of such an
+        object does not count as a miss.
         """
         if not self.by_labeller:
             return None

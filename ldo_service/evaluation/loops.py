@@ -109,9 +109,10 @@ class LoopErrors:
 
     @property
     def recall(self) -> float | None:
-        """Fraction of the queries that a loop closure connects to an older subgraph of a true pair.
+        """Fraction of the queries for which the run found a true loop closure.
 
-        A query is a subgraph that forms a true pair with at least one older subgraph.
+        A query is a subgraph that forms true pairs with one or more older subgraphs. A true loop
+        closure connects the query to one of these older subgraphs.
         """
         return self.closed_queries / self.queries if self.queries else None
 

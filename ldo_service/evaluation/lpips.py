@@ -62,7 +62,7 @@ class Lpips:
                 f"{_first_line(error)}. Export the network with dynamic height and width."
             ) from error
         if out.size != 1:
-            raise self._misfit(f"the output has the shape {out.shape}, but must be a single number")
+            raise self._misfit(f"the network output has shape {out.shape}, must be a single number")
         return float(out.item())
 
     def _require_layout(self) -> None:

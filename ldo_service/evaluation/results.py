@@ -136,7 +136,7 @@ def run_loop_errors(run: FinishedRun, sequence: Sequence, truth: Trajectory) -> 
 
 
 def compare(run: FinishedRun, truth: Trajectory) -> dict[str, TrajectoryErrors]:
-    """Score each estimated trajectory against the truth.
+    """Score each estimated trajectory against the ground truth.
 
     Returns:
         Errors over all frames with a pose, by name of the estimate. If some of these frames do not

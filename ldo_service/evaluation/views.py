@@ -85,7 +85,7 @@ def ssim(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
     This formula of Wang et al., TIP 2004, uses the means m_a and m_b, the standard deviations s_a
     and s_b, and the covariance s_ab of a channel in an 11x11 Gaussian window of sigma 1.5 px. The
     constants are c1 = 0.01^2 and c2 = 0.03^2. The mean is over channels and over pixels whose
-    window lies in the image. Some papers print the often higher multi-scale MS-SSIM as SSIM.
+    window lies in the image. Multi-scale SSIM is often higher, and some papers print it as SSIM.
 
     Args:
         a: Image [H, W, 3].

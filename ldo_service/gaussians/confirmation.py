@@ -11,7 +11,7 @@ from .renderer import VisibleGaussians
 
 
 class Confirmation:
-    """Choice of keyframes: each new keyframe starts a visibility check of their Gaussians.
+    """Choice of the keyframes whose Gaussians are checked for visibility at each new keyframe.
 
     Args:
         store: Store of the keyframe images.

@@ -143,7 +143,8 @@ class Fitting:
     def plan_refinement(self, iterations: int, first: Sequence[int]) -> Iterable[int]:
         """Return `iterations` keyframes, alternately from `first` and at random.
 
-        The result is shorter if offloaded Gaussians may be visible in most keyframes.
+        The random choice skips keyframes in which offloaded Gaussians may be visible. The result is
+        shorter if most keyframes are skipped.
         """
         drawn = self._sample_keyframes(iterations - len(first))
         return (k for pair in zip_longest(first, drawn) for k in pair if k is not None)

@@ -55,9 +55,9 @@ class KeyframeStore:
 
     If `folder` is None, the store uses a temporary folder, which it removes when it is closed.
     Above its quota, the store drops the keyframe whose previous and next stored keyframes have the
-    closest ids, because these two probably show the same surface. If the disk is full, a new
-    keyframe is available only while it is in the cache. The content depends only on the calls, not
-    on time. Not thread-safe.
+    closest ids. The previous and the next keyframe then probably show the same surface. If the disk
+    is full, a new keyframe is available only while it is in the cache. The content depends only on
+    the calls, not on time. Not thread-safe.
 
     Attributes:
         files: The folder of the images.

@@ -216,7 +216,7 @@ class MapBuilder:
 
         Returns:
             Number of iterations that were run. It is below `iterations` if `effort` was reached, or
-            if offloaded Gaussians may be visible in most keyframes.
+            if most keyframes were skipped, because offloaded Gaussians may be visible in them.
         """
         self._renderer.forget()
         before = self.fitting.iterations

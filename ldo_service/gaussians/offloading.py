@@ -37,10 +37,10 @@ class OffloadedGaussians:
     used and removed at the end. Not thread-safe.
 
     The folder contains the chunks of one map only. When a chunk is loaded, its file is retired: the
-    file stays, since a process restored from the last snapshot would need it. The file is removed
-    once a later snapshot has been saved, which does not contain the chunk. `restore` removes all
-    files newer than the snapshot, and retires older files that the snapshot does not contain.
-    Without `restore`, the first `put` removes all earlier files.
+    file stays, since a process restored from the last snapshot would need it. Later snapshots do
+    not contain the chunk. Once a later snapshot has been saved, the file is removed. `restore`
+    removes all files newer than the snapshot, and retires older files that the snapshot does not
+    contain. Without `restore`, the first `put` removes all earlier files.
 
     Attributes:
         files: The folder of the chunks.

@@ -186,8 +186,9 @@ class GaussianOptimizer:
             fixed: Keyframe whose pose and exposure stay constant, to fix the pose and the
                 brightness of the map. With None, no keyframe stays constant.
             effort: Limit of the computing time. The unit is the time of an iteration at full
-                resolution with `usual_reach` visible Gaussians. An iteration with r times as many
-                counts as (1 + r) / 2. At half resolution, this value is multiplied by HALF_EFFORT.
+                resolution with `usual_reach` visible Gaussians. With r times this number of
+                Gaussians, an iteration takes (1 + r) / 2 units. At half resolution, this number of
+                units is multiplied by HALF_EFFORT.
                 No iteration starts once the sum has reached `effort`.
             starts_half: Start at half resolution, for the fraction `half_share` of `effort`.
             observe: Function that is called after each iteration with the keyframe and the visible

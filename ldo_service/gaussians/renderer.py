@@ -155,8 +155,9 @@ class Rasterizer:
             needle_weight * mean over pixels of
                 sum_i w_i max(0, log(longest / middle axis of Gaussian i) - log needle_ratio)
 
-        The derivative of this term treats the blending weights w_i as constants. The rows must not
-        have changed since the rendering. The result is bitwise equal for any number of threads.
+        The derivative of this term treats the blending weights w_i as constants. The rendered rows
+        must not have changed since the rendering. The result is bitwise equal for any number of
+        threads.
 
         Args:
             by_planes: dL/dplanes without the additional term, [5, H, W] as `render` returns them.
@@ -291,7 +292,7 @@ class Rendering:
 
     @property
     def depth_m(self) -> np.ndarray:
-        """Mean depth [H, W] in meters, 0 where the opacity is at most 0.5; not stored."""
+        """Mean depth [H, W] in meters, 0 where the opacity is at most 0.5; computed on access."""
         covered = self.opacity > 0.5
         return np.where(covered, self.weighted_depth_m / np.where(covered, self.opacity, 1), 0)
 

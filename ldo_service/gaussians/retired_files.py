@@ -6,9 +6,10 @@ from ldo_service.storage.checksummed_folder import ChecksummedFolder
 class RetiredFiles:
     """Files that the current state does not need any more, but that a saved state may need.
 
-    The last saved state always counts. Older saved states, called generations, count too if the
-    service keeps them. The service restores an older generation if the last state is damaged. A
-    file is given by its number in the folder.
+    A file is kept while the last saved state needs it. If the service keeps older saved states,
+    called generations, a file is also kept while one of these generations needs it. The service
+    restores an older generation if the last state is damaged. A file is given by its number in the
+    folder.
     """
 
     def __init__(self, files: ChecksummedFolder) -> None:
@@ -18,7 +19,7 @@ class RetiredFiles:
         self._kept: list[int] = []  # The newest kept generation does not need them.
 
     def add(self, number: int) -> None:
-        """Mark a file for removal as soon as no saved state needs it.
+        """Add a file, which is removed as soon as no saved state needs it.
 
         A file in a temporary folder is removed at once, because no restored process uses it.
         """
@@ -32,7 +33,7 @@ class RetiredFiles:
         self._unsaved, self._new = [*self._unsaved, *self._new], []
 
     def restart(self, numbers: list[int]) -> None:
-        """Forget all files, and start with those that a restored state does not need.
+        """Replace all added files by the files that a restored state does not need.
 
         Args:
             numbers: Numbers of the files that the restored state does not need.

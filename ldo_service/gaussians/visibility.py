@@ -183,7 +183,7 @@ class BoundingSpheres:
     """Bounding spheres of K chunks of Gaussians.
 
     The Gaussians of a chunk move with the same keyframe, called their anchor keyframe. The sphere
-    of a chunk contains its Gaussians to the extent to which they are rendered.
+    of a chunk contains the rendered extent of each of its Gaussians.
 
     Attributes:
         anchors: Id of the anchor keyframe of each chunk, [K]. Several chunks may share one

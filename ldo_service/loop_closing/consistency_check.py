@@ -53,8 +53,8 @@ class ConsistencyCheckConfig:
 class ConsistencyChecker:
     """Check of loop hypotheses against the known keyframe poses.
 
-    A hypothesis between two submaps is not checked if they are not merged, because their relative
-    pose is unknown.
+    A hypothesis between two submaps that are not merged is not checked, because the relative pose
+    of the submaps is unknown.
     """
 
     def __init__(

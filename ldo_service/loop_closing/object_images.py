@@ -78,9 +78,10 @@ def compare_images(
     """Compare the images of an object in two keyframes.
 
     The compared pixels form a grid on the object in the first image. The depth of each pixel gives
-    a surface point, which the keyframe poses transform to the second image. A point is left out if
-    its depth there differs from the measured depth. The correlation is normalized, so exposure and
-    brightness do not change it.
+    a surface point, which the keyframe poses transform to the second camera. A point is left out if
+    its depth in this camera differs from the measured depth. The result contains the correlation
+    of the gray levels of the remaining points. Exposure and brightness do not change this
+    normalized correlation.
 
     Args:
         p_map: Centroid of the object, [3], meters.

@@ -148,8 +148,9 @@ def cluster_landmarks(
 ) -> SubgraphLandmarks:
     """Merge the detections of a subgraph's keyframes into landmarks, one per object.
 
-    The position and the label distribution of a landmark are means over its detections. In the
-    distribution of a detection, its label has its score as probability, and `other` has the rest.
+    The position and the label distribution of a landmark are means over its detections. Each
+    detection counts as a distribution with two entries: the label has the detection's score as
+    probability, and `other` has the rest.
 
     Args:
         seen: Detections of each keyframe.

@@ -121,7 +121,7 @@ class ObjectPresence:
 
     @property
     def contradicts(self) -> bool:
-        """True if missing plus replaced exceeds the fraction `MAX_MISSING_RATIO` of the tests."""
+        """True if `missing` + `replaced` exceeds the fraction `MAX_MISSING_RATIO` of `tested`."""
         return self.missing + self.replaced > MAX_MISSING_RATIO * self.tested
 
 
@@ -193,7 +193,7 @@ class ObjectPresenceChecker:
         T_there_new: np.ndarray,
         poses: KeyframePoses,
     ) -> ObjectPresence:
-        """Look for the objects that each of two subgraphs shows in the views of the other one.
+        """Search the views of each of two subgraphs for the objects that the other one shows.
 
         Objects may have a wrong position in the map, for example before a correction. Such an
         object is not visible in its own subgraph at this position, and is therefore not tested.

@@ -187,8 +187,9 @@ class PlaceDatabase:
     ) -> list[RetrievalMatch]:
         """Return the stored subgraphs that may show the same place, the likeliest first.
 
-        The most similar subgraphs come first; the setting `candidates` limits their number. The
-        nearest other subgraph in the map follows if it is within the setting `max_motion_rad`.
+        The most similar subgraphs come first; the setting `candidates` limits their number. Of
+        the remaining subgraphs, the one with the smallest `motion_rad` follows if this value is at
+        most the setting `max_motion_rad`.
 
         Args:
             new: Subgraph to search for.

@@ -162,8 +162,8 @@ def follows(before: KeyframeRecord, place: KeyframeRecord, config: SubgraphConfi
     """Return whether a keyframe belongs to the same subgraph as the previous keyframe.
 
     Both keyframes must be in the same submap, and the rotation plus parallax between them must not
-    exceed `gap_rad`. Consecutive keyframes are far apart if the tracker reused existing keyframes
-    between them.
+    exceed `gap_rad`. Consecutive keyframes can be far apart, because the tracker may have reused
+    existing keyframes between them.
 
     Args:
         before: Record of the previous keyframe.

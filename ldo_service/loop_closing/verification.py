@@ -259,7 +259,7 @@ class Verifier:
     def hypothesis_from_map(
         self, old: Subgraph, new: Subgraph, T_old_new: KnownPose
     ) -> LoopHypothesis:
-        """Return a pose from the map that the image alignment of two new keyframes confirms.
+        """Refine poses from the map by image alignment, and return the first confirmed pose.
 
         Up to `map_pairs` pairs of an old and a new keyframe are aligned, the nearest pairs first.
         Each alignment starts at the pose of the pair in the map, `T_old_new`, and refines it. Two
@@ -324,7 +324,7 @@ class Verifier:
         """Accept the pose from landmarks as a loop closure without refinement or checks.
 
         The LDO-SLAM paper also accepts loop closures right after the comparison of landmarks. The
-        mode `semantic` uses this function, so that it can be compared with the other modes.
+        mode `semantic` does the same, so that the paper's method can be compared with other modes.
         """
         sigma_m = self._config.landmarks.reach_m / np.sqrt(proposal.inliers)
         sigmas = np.repeat([sigma_m / _depth(proposal), sigma_m], 3)

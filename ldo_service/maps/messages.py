@@ -63,9 +63,9 @@ def rechunk(batches: Iterable[GaussianBatch], parts: int, size: int) -> Iterator
 def split_changes(changes: Changes, size: int) -> Iterator[Changes]:
     """Divide changes of the map into parts of at most `size` changed or added Gaussians.
 
-    The first part has the ids of all removed Gaussians, which may be more than `size`. Then follow
-    parts with changed Gaussians, and at the end parts with added Gaussians. Empty parts are
-    omitted.
+    The first part has the ids of all removed Gaussians, which may be more than `size`. The
+    next parts have the changed Gaussians, and the last parts have the added Gaussians. Empty parts
+    are omitted.
     """
     if len(changes.removed):
         yield Changes(changes.removed, NO_IDS, NO_IDS)

@@ -20,8 +20,8 @@ class RelativeMeasurements:
     """Table of the relative-pose measurements that tracking made, by pair of keyframes.
 
     All measurements of the newest `recent` keyframes are stored. For an older keyframe, only the
-    measurement relative to its reference keyframe is stored (100 bytes). The pose-graph optimizer
-    no longer uses the other measurements of an older keyframe.
+    measurement relative to its reference keyframe is stored, which takes 100 bytes. The pose-graph
+    optimizer no longer uses the other measurements of an older keyframe.
     """
 
     def __init__(self, poses: KeyframePoses, recent: int) -> None:
@@ -102,9 +102,9 @@ class RelativeMeasurements:
         )
 
     def acknowledged(self, refinements: int) -> KeysView[int]:
-        """Return the keyframes whose last refined pose a pose correction does not include yet.
+        """Return the keyframes whose last refinement is missing from a pose correction.
 
-        The entries of all other keyframes are deleted.
+        All other keyframes are deleted from the table of unacknowledged refinements.
 
         Args:
             refinements: Number of the last refinement message that the correction includes.

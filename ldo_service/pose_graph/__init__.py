@@ -37,7 +37,8 @@ iSAM2 minimizes F incrementally (`pose_graph`). A batch solver minimizes F to ch
 (`loop_closures`). KL is jointly convex, so G is convex in all p together as long as no likeliest
 class changes. Repeated minimization over one landmark after the other then converges to the only
 minimum (`label_fusion`). Without similarity, this minimum is the weighted geometric mean of the
-observations. Below, nu is the Lagrange multiplier of sum_c p_c = 1, and ~ means proportional to:
+observations. Its derivation uses the Lagrange multiplier nu of the constraint sum_c p_c = 1. The
+sign ~ means "is proportional to":
 
     d/dp_c [ sum_k w_k p_c log(p_c / q_kc) ] + nu = 0   =>   p_c ~ prod_k q_kc^(w_k / sum w)
 

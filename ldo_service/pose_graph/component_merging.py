@@ -30,7 +30,7 @@ class BridgeEdge:
     Attributes:
         pair: Ids of the two keyframes that the edge connects.
         connected_keyframes: Ids of the keyframes on the far side of the edge. Without the edge,
-            they would not be connected to the first keyframe of the component.
+            these keyframes would not be connected to the first keyframe of the component.
     """
 
     pair: Pair
@@ -110,7 +110,7 @@ def best_bridge_removal(
     variables: Variables,
     initial: Variables,
 ) -> tuple[BridgeEdge, FactorStore, Variables] | None:
-    """Replace one of several bridge edges by a rejected closure if more closures then agree.
+    """Replace one of several bridge edges by a closure if more closures are then accepted.
 
     A bridge edge is a loop closure that merged two components of the graph. The replacement of each
     edge is tried by `replace_bridge_by_consensus`. The replacement with the most accepted closures

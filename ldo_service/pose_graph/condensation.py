@@ -92,8 +92,9 @@ class CondensedKeyframes:
 
         Args:
             row: Row of the keyframe.
-            pose: Function that returns T_map_keyframe [4, 4] of a variable by its id. It is called
-                with the variables before (head) and after (tail) the keyframe.
+            pose: Function that returns T_map_keyframe [4, 4] of a variable by its id. The
+                arguments are the ids of the head (variable before the keyframe) and the tail
+                (variable after it).
         """
         one = self.only(row)
         T_head, T_tail = (pose(k)[None] for k in one.head_and_tail(0))
@@ -222,10 +223,10 @@ def group_to_condense(
     of the chain. The first keyframe of a group is its head, and the last one is its tail. Head and
     tail stay variables. The head or tail of an existing group may only be the head of a new group.
 
-    The group is extended, up to twice `size`, until the keyframe after the group is measured
-    relative to the tail. Otherwise, that keyframe might be measured only relative to keyframes
-    inside the group. Condensation would transfer these measurements to the head or the tail, and
-    later corrections would move the keyframe with this variable only.
+    The group is extended, up to twice `size`, if the next keyframe has measurements relative to the
+    group, but none relative to the tail. Without the extension, condensation would transfer these
+    measurements to the head or the tail. Later corrections would then move the next keyframe with
+    the head or the tail only.
 
     Args:
         active: Keyframes that may still be condensed, ascending (`FactorStore.active`).

@@ -64,8 +64,8 @@ class FactorStore:
         """Store an odometry measurement and return the name of its factor.
 
         If both keyframes are variables, the measurement replaces an older one of the same pair.
-        Otherwise, it is converted by `between_variables`, and stored only if the two variables have
-        no odometry measurement yet.
+        Otherwise, `between_variables` converts the new measurement to one between two variables. It
+        is stored only if these variables have no odometry measurement yet.
         """
         between = self.between_variables(m)
         pair = between.a, between.b
@@ -78,8 +78,8 @@ class FactorStore:
     ) -> Name | None:
         """Replace a measurement and return the name of the factor that changed.
 
-        If keyframe b is condensed, only its pose relative to the variables before and after it
-        changes. No factor changes then, and None is returned.
+        If keyframe b of the measurement is condensed, only the pose of b relative to the variables
+        before and after b changes. No factor changes in this case, and None is returned.
 
         Args:
             m: New measurement.
@@ -143,9 +143,9 @@ class FactorStore:
     def restore_variable(self, keyframe: int) -> None:
         """Make a condensed keyframe a variable again.
 
-        So far, one measurement connects the variables before and after the keyframe. It is replaced
-        by two measurements, one to the keyframe and one from the keyframe. They share its
-        covariance in proportion to `CondensedKeyframes.fractions`.
+        Before the call, one measurement connects the variables before and after the keyframe. Two
+        new measurements replace it: one to the keyframe, one from the keyframe. The new ones share
+        the covariance of the old one in proportion to `CondensedKeyframes.fractions`.
         """
         row = self.rows[keyframe]
         head, tail = self.interpolated.head_and_tail(row)

@@ -62,14 +62,15 @@ def fuse_labels(
 
     The distributions minimize this sum:
 
-        min_p  lambda sum_lk w_k KL(p_l || q_lk)
-             + w_sem / 2 sum_ij (KL(p_i || p_j) + KL(p_j || p_i)) [argmax p_i = argmax p_j]
+        lambda sum_lk w_k KL(p_l || q_lk)
+        + w_sem / 2 sum_ij (KL(p_i || p_j) + KL(p_j || p_i)) [argmax p_i = argmax p_j]
 
     The observation of landmark l in keyframe k has the class distribution q_lk and the weight w_k.
     The bracket is 1 if both landmarks have the same likeliest class, else 0. The method is
     Gauss-Seidel (LDO-SLAM paper, III.C): each sweep minimizes over one landmark after the other, in
-    the order of their ids. Just before each of these steps, the neighbors of the landmark with the
-    same likeliest class are determined again. Equal arguments give equal results.
+    the order of their ids. Just before the minimization over a landmark, the sweep determines again
+    which neighbors have the same likeliest class as this landmark. Equal arguments give equal
+    results.
 
     Args:
         evidence: Sums over the observations of each landmark, by its id.

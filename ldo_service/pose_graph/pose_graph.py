@@ -31,8 +31,8 @@ from .solver import Name, Solver, Variables, point_key
 class PoseGraph:
     """Pose graph of keyframes and landmarks, solved incrementally by iSAM2.
 
-    The solver minimizes the cost F of keyframe poses and landmark positions; its formula is in
-    `ldo_service.pose_graph`. Keyframes that measurements connect form a component, whose first
+    The solver minimizes the cost F of keyframe poses and landmark positions. The package docstring
+    gives the formula of F. Keyframes that measurements connect form a component, whose first
     keyframe stays fixed. A measurement between two components merges them in the older one's frame.
 
     The state of iSAM2 cannot be saved, and a new solver with the same measurements differs in the

@@ -117,8 +117,9 @@ def surfaces(depth_m: np.ndarray, camera: Camera, config: ForegroundConfig) -> S
 
     - All depths in the 3x3 pixels around it are known, and no two of these depths differ by more
       than the fraction max_step.
-    - The normals 2 px to its left and 2 px to its right have a cosine above min_cosine. So do the
-      normals 2 px above it and 2 px below it. The normals are computed from blurred depth.
+    - Two cosines are above min_cosine: between the normals 2 px to its left and 2 px to its right,
+      and between the normals 2 px above and 2 px below it. The normals are computed from blurred
+      depth.
 
     Two such pixels that share a side belong to the same surface. Surfaces are numbered from 1 in
     the order of their first pixels, row by row. If a cosine is exactly at its threshold, the result
@@ -219,8 +220,9 @@ def pixels_of(box: np.ndarray, shape: tuple[int, ...]) -> tuple[slice, slice]:
 class NestingConfig:
     """Settings of nested regions: an object in front of a larger one, such as a cup on a table.
 
-    The smaller region gets the pixels that both regions contain. The scores do not decide: a table
-    with a score of 0.9 would then get the pixels of a cup with a score of 0.5.
+    The smaller region gets the pixels that both regions contain, even if its score is lower. If the
+    higher score decided, a table with a score of 0.9 would get the pixels of a cup with a score of
+    0.5.
     """
 
     inside: float = 0.8  # Minimum fraction of the smaller region that lies in the larger region.

@@ -174,8 +174,8 @@ class OpenVocabularyLabeling:
 
         Returns:
             One box with the labels by the detector and by the labeller. None if the result has no
-            label, if no request for it is pending, or if another label has the most votes of the
-            region after the vote of the result is added.
+            label, if no request is pending for the region and keyframe, or if another label has the
+            most votes of the region even after the vote of the result.
         """
         pending = self._open.pop((region, keyframe), None)
         if pending is None:
@@ -337,8 +337,8 @@ def add_region_labels(
 
     If a region belongs to a box, the region's label becomes the labeller's label of the box
     (`RegionDetections.open_labels`). If `boxes_vote` is true, the detector's label of the box is
-    dropped, because the region's label already includes its vote. A region without a box is added
-    as a new box, unless the region is a part of a larger region with the same label.
+    dropped, because the region's label already includes the vote of the box. A region without a box
+    is added as a new box, unless the region is a part of a larger region with the same label.
 
     Args:
         detections: Detections of the keyframe.

@@ -26,7 +26,7 @@ _EPSILON = np.float32(1e-6)
 class PlaneConfig:
     """Settings of the planes that are fitted to the depth of a keyframe.
 
-    With these values, the region proposals covered the objects of the sequence `synthetic:flat`
+    With the default values, region proposals covered the objects of the sequence `synthetic:flat`
     best. No other sequences were tried. Settings that end in `_px` are in pixels of the small
     image, which is the depth image scaled down to a width of about `width_px`.
     """
@@ -65,7 +65,8 @@ class PlaneConfig:
             )
         if not 0 <= self.gap_px[0] < self.gap_px[1]:
             raise ConfigError(
-                named(self, "gap_px") + ": both must be at least 0, and the second must be larger."
+                named(self, "gap_px")
+                + ": the first number must be at least 0, and the second must exceed the first."
             )
 
 

@@ -47,7 +47,8 @@ def with_box(votes: Votes, name: str, sure: float, most: float) -> Votes:
         sure: Score of the box, 0..1.
         most: Maximum sum of the votes for the label; at a larger sum, the box adds nothing.
 
-    Example: a box with a score of 0.6 adds 0.36. The next one would add 0.25 and adds only 0.04.
+    Example: with the limit 0.4, a box with a score of 0.6 adds 0.36. The next box has a score of
+    0.5. Its vote of 0.25 is cut to 0.04, so that the sum is 0.4.
 
     >>> with_box(with_box((), "tv", 0.6, 0.4), "tv", 0.5, 0.4)
     (('tv', 0.4, 0.6),)
@@ -74,8 +75,8 @@ def winning_label(votes: Votes, least: float) -> tuple[str, float]:
     """Return the label with the largest sum of votes, and its confidence.
 
     Each entry of `votes` has a label, the sum of its votes, and the highest confidence of one of
-    these votes. A vote may be a fraction. The returned confidence is this highest confidence times
-    the label's fraction of all votes. The result is ("", 0) if the sum is below `least`.
+    these votes. The returned confidence is the winning label's highest confidence, times the
+    label's fraction of all votes. The result is ("", 0) if the largest sum is below `least`.
 
     >>> winning_label((("tv", 0.6, 0.5), ("oven", 0.4, 0.6)), 0.35)
     ('tv', 0.3)
@@ -281,7 +282,7 @@ def merge_observation(region: Region, seen: RegionObservation, max_box_votes: fl
     Args:
         region: The region.
         seen: The observation.
-        max_box_votes: Maximum vote sum of a label that boxes alone can reach, see `with_box`.
+        max_box_votes: Maximum vote sum that a label can reach by boxes alone, see `with_box`.
     """
     proposal = seen.candidate
     surer = max(region, proposal, key=lambda one: one.score)

@@ -95,8 +95,8 @@ class ActorRun:
 
         Args:
             frames: Number of frames.
-            rejected: Number of frames that could not be used, not counting those that the actor
-                frame_source rejected. The summary adds the latter.
+            rejected: Number of unusable frames, not counting those that the actor frame_source
+                rejected. This function adds the frames that frame_source rejected.
             used: Elapsed time and CPU time that the frames took.
             is_finished: False if the run was interrupted.
         """

@@ -144,7 +144,7 @@ class RunWriter:
     """Record of the outputs of a run's actors, and writer of the run's folder.
 
     If the constructor gets a folder, it writes config.yaml there, and `observe` writes frames.csv
-    during the run. `save` writes all files, with or without such a folder.
+    during the run. `save` writes all files, even if the constructor got no folder.
     """
 
     def __init__(self, folder: Path | None, config_text: str, tracker: TrackerConfig) -> None:

@@ -1,7 +1,8 @@
-"""Benchmark of the mapper alone: CPU time per keyframe by stage, and errors on held-out frames.
+"""Benchmark of the mapper: CPU time per keyframe by stage, and errors on held-out frames.
 
-A source is tracked once, and its keyframes are recorded. They are then mapped at their final poses
-without corrections, so that measurements with different settings differ by the mapper alone.
+A source is tracked once, and its keyframes are recorded. Each measurement maps these keyframes at
+their final poses without corrections. Measurements with different settings of the mapper therefore
+use the same keyframes and poses.
 """
 
 import re

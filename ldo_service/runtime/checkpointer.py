@@ -98,7 +98,8 @@ class Checkpointer:
         Args:
             actor: The actor of the stage.
             links: Offsets and unhandled outputs of the stage, as `links` returns them.
-            taken: Input of the last step, for the write-ahead log; None unless `Actor.lags`.
+            taken: Input of the last step, for the write-ahead log; None if `Actor.lags` is
+                False.
             whole: Save `Actor.checkpoint`, the complete state, instead of `Actor.snapshot`. The
                 complete state is also saved if the write-ahead log is full.
         """

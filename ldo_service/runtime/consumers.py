@@ -265,12 +265,12 @@ class Consumers:
         self.leave(name)
 
     def is_still_stuck(self, grant: Credit) -> bool:
-        """Return whether an evicted consumer sent this credit message without having made progress.
+        """Return whether a credit message shows that an evicted consumer is still stuck.
 
-        Progress is a message handled since the eviction. Credit messages alone are no progress,
-        because a consumer repeats them with each heartbeat. A consumer that has handled all
-        messages that it received is not stuck: it waits for messages that the network has lost. The
-        producer retransmits these only to connected consumers, so it must connect it again.
+        A consumer is stuck if it has received unhandled messages, but has handled none since the
+        eviction. Credit messages are no progress: a consumer repeats them with each heartbeat. A
+        consumer that has handled all received messages waits for messages that the network has
+        lost. It must be reconnected, because the producer retransmits only to connected consumers.
         """
         has_work = grant.handled < grant.arrived
         return has_work and grant.handled <= self._evicted.get(grant.consumer, -1)

@@ -236,7 +236,7 @@ def _messages(
 
 
 def counts_by_topic(counts: Mapping[str, int], topics: Iterable[Topic]) -> dict[Topic, int]:
-    """Replace the topic names in `counts` by the topics; leave out topics without a count."""
+    """Return `counts` with topics instead of names as keys; leave out topics without a count."""
     return {topic: counts[topic.name] for topic in topics if topic.name in counts}
 
 

@@ -9,8 +9,8 @@ a consumer has not handled.
 `GenerationKeeper` asks the actors one after the other, consumers first, so that the state of a
 producer is newer than those of its consumers. It then compares the positions on all topics in these
 states. If the positions are consistent, it writes the number of the generation to the marker file,
-which completes the generation. When the service begins another generation, it deletes all others
-except the last complete one.
+which completes the generation. When an actor begins to write a new generation, it deletes its
+copies of all older generations except the last complete one.
 """
 
 import asyncio

@@ -138,7 +138,8 @@ class Journal:
     def record_input(self, delivery: Delivery, stamp_ns: int) -> None:
         """Record the input of the next step, and the stamp of its message in ns.
 
-        If the step fails, the stage repeats it with the same input, without another call.
+        If the step fails, the stage repeats it with the same input and does not call this
+        method again.
         """
 
     def record_step(

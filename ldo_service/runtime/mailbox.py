@@ -256,8 +256,8 @@ class Mailbox:
     def put_command(self, order: StageCommand) -> list[StageCommand]:
         """Queue a command; `take` returns commands before messages.
 
-        The command `keep` makes the actor copy its saved state. A new `keep` command replaces
-        those in the queue, so that an actor that was busy for long copies its state only once.
+        The command `keep` makes the actor copy its saved state. A new `keep` command replaces the
+        queued `keep` commands. An actor that was busy for long then copies its state only once.
 
         Args:
             order: The command.

@@ -152,12 +152,13 @@ class Outbox:
     def keep(self, handled: int, *, is_previous_complete: bool) -> None:
         """Retain the messages that consumers need if the service falls back to older states.
 
-        The stage calls this method when the producer copies its state for a new generation.
+        A generation has copies of the states of all actors; see `runtime.generations`. The stage
+        calls this method when the producer copies its state for a new generation.
 
-        A generation has copies of the states of all actors; see `runtime.generations`. The
-        consumers copy their states before the producer does, and then handle further messages. A
-        consumer that is restored from its copy needs these messages again. The outbox therefore
-        retains all messages that were unhandled when `keep` was called for the previous generation.
+        The consumers copy their states before the producer does, and then handle further messages.
+        A consumer that is restored from its copy needs these further messages again. The outbox
+        therefore retains all messages that were unhandled when `keep` was called for the previous
+        generation.
 
         Args:
             handled: Number of the first message that a consumer has not handled.

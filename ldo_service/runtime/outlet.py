@@ -115,8 +115,8 @@ class Outlet:
     def credits(self) -> int:
         """Return the number of messages that may be sent now; 0 while staged messages wait.
 
-        Consumers with policy `Backlog` limit it only if the port is nonblocking and all required
-        consumers have this policy. The result then fits into their queues, so no backlog grows.
+        Consumers with policy `Backlog` limit this number only if the port is nonblocking and all
+        required consumers have this policy. Messages then fit into their queues; no backlog grows.
         """
         if self._unsent:
             return 0
@@ -153,7 +153,7 @@ class Outlet:
             await self._publisher.send(held.header, held.body)
 
     def rollback(self) -> None:
-        """Discard the staged messages; later messages get their numbers."""
+        """Discard the staged messages, and reuse their numbers for later messages."""
         self._seq = self._next
         self.outbox.truncate(self._seq)
         self._unsent.clear()
@@ -177,9 +177,9 @@ class Outlet:
             await self._change()
 
     async def flush(self) -> None:
-        """Wait until every lossless consumer has received all messages.
+        """Wait until every consumer with policy `Lossless` has received all messages.
 
-        Wait at most `FLUSH_BACKLOG_S` for consumers with policy `Backlog`, which may be stopped.
+        Then wait at most `FLUSH_BACKLOG_S` for `Backlog` consumers, which may be stopped.
         """
         self._post_hellos()  # Each consumer immediately replies with its credit.
         while not self._consumers.all_received(self._seq, awaited_only=True):

@@ -181,10 +181,11 @@ class Outlets:
     def keep(self, *, is_previous_complete: bool) -> None:
         """Retain the messages that consumers need if the service falls back to older states.
 
-        See `Outbox.keep`. A generation has copies of the states of all actors.
+        See `Outbox.keep`.
 
         Args:
-            is_previous_complete: Whether the previous generation is complete.
+            is_previous_complete: Whether the previous generation is complete. A generation has
+                copies of the states of all actors.
         """
         for outlet in self._all.values():
             outlet.outbox.keep(outlet.handled, is_previous_complete=is_previous_complete)

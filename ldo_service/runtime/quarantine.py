@@ -53,7 +53,7 @@ class Quarantine:
     deliveries, the stage writes the message to the folder instead of handling it.
 
     The actors of one process handle only one suspected message at a time. If the process ends
-    again, the count of no other suspected message increases. Messages of inputs that are not
+    again, the counts of the other suspected messages stay the same. Messages of inputs that are not
     lossless are never delivered again and therefore not counted.
 
     Attributes:
@@ -73,7 +73,7 @@ class Quarantine:
             self._load()
 
     def is_due(self, delivery: Delivery) -> bool:
-        """Return whether to quarantine a message, because it has ended the process too often."""
+        """Return whether a message was delivered so often that it must be quarantined."""
         return self._deliveries_of(delivery) >= MAX_DELIVERIES
 
     @asynccontextmanager

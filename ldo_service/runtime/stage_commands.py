@@ -14,8 +14,8 @@ Commands:
 - `resume`: Take messages again.
 - `reset`: Start with an empty state, and number the output messages from 0 again.
 - `save`: Write the whole state now.
-- `keep`: Copy the last saved state for a generation: copies of the states of all actors, to which
-  the service can fall back. See `generations`.
+- `keep`: Copy the last saved state into a generation. A generation has copies of the states of all
+  actors, so that the service can fall back to them. See `generations`.
 
 `control.Control` gives these commands to all stages of a service.
 """
@@ -133,8 +133,8 @@ class CommandSender:
             what: The command.
             stage: Name of the stage.
             timeout_s: Maximum time to wait for the reply, seconds.
-            generation: For the command `keep`, two numbers: of the generation to keep, and of the
-                last complete generation.
+            generation: Number of the generation to keep, and number of the last complete
+                generation; only used by the command `keep`.
 
         Returns:
             An empty string on success, otherwise the error message. No reply within `timeout_s`

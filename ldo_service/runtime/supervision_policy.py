@@ -177,7 +177,8 @@ class SupervisionConfig:
                     "max_message_mb",
                     "backlog_mb",
                 )
-                + " must be positive; max_restarts and the delays may be 0."
+                + ": max_restarts, restart_delay_s and restart_delay_max_s must be at least 0, "
+                "and the other settings must be positive."
             )
         if not 0 <= self.nice <= 19:
             raise ConfigError(f"supervision.background_nice={self.nice} must be within 0..19.")

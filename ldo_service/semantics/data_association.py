@@ -71,7 +71,7 @@ class MapView:
             )
         if len(self.regions) != v or (v and not self.indices[-1] < n):
             raise ValueError(
-                f"regions has {len(self.regions)} entries, must have {v}, one for each of indices. "
+                f"regions has {len(self.regions)} entries, must have {v}, as many as indices. "
                 f"The values of indices must be below {n}, the number of Gaussians in the map."
             )
         if v and self.regions.max() >= len(self.boxes):
@@ -120,8 +120,8 @@ def compute_region_statistics(
 ) -> RegionStatistics:
     """Compute the statistics of the regions of a keyframe.
 
-    Regions with fewer than `config.min_gaussians` Gaussians are ignored. Of the others, at most
-    `config.max_regions` are used: those with the most Gaussians.
+    The function uses at most `config.max_regions` regions: those with the most Gaussians. Regions
+    with fewer than `config.min_gaussians` Gaussians are ignored.
     """
     hit = np.flatnonzero(view.regions >= 0)
     counts = np.bincount(view.regions[hit], minlength=len(view.boxes))
@@ -145,10 +145,10 @@ def compute_region_statistics(
 
 
 def merge_parts(view: MapView, regions: RegionStatistics, config: AssociationConfig) -> MapView:
-    """Return the view in which each region that lies within another one is merged into that region.
+    """Return a view where each region inside a larger region is merged into the larger region.
 
-    The Gaussians of a merged region then belong to the region that contains it. The function
-    `find_containing_regions` finds this region.
+    The Gaussians of each merged region then belong to the larger region. The function
+    `find_containing_regions` finds the larger region.
     """
     near_m = np.full(len(view.boxes), np.inf)
     far_m = -near_m
@@ -264,7 +264,7 @@ def _sampled(view: MapView, hit: np.ndarray, counts: np.ndarray, numbers: np.nda
 class PredictedBoxes:
     """Predicted boxes and visibility of K landmarks in a keyframe.
 
-    Each landmark has members: a sample of its Gaussians. Only the reliable ones are projected; see
+    Each landmark has members: a sample of its Gaussians. Only reliable members are projected; see
     `reliable_members`.
 
     Attributes:
@@ -370,7 +370,7 @@ def association_costs(
     regions: RegionStatistics,
     config: AssociationConfig,
 ) -> AssociationCosts:
-    """Compute the association costs of K landmarks, with label distributions, and R regions."""
+    """Compute the association costs of K landmarks (with label distributions) and R regions."""
     iou = ious(predicted.boxes, regions.boxes)
     gap_m = depth_gaps_m(predicted.near_m, predicted.far_m, regions.near_m, regions.far_m)
     allowed = (iou > 0) & (gap_m <= config.max_depth_gap_m)

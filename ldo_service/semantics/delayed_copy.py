@@ -142,7 +142,7 @@ class GaussianLabels:
             gaussians.labels[:] = shown
 
     def write(self, gaussians: GaussianMap) -> np.ndarray:
-        """Write the labels into a map, and return the numbers of the changed rows.
+        """Write the labels into a map, and return the indices of the changed rows.
 
         Gaussians that are on disk instead of in memory keep their labels.
         """

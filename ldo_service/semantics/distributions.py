@@ -61,8 +61,9 @@ def sparse(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     Returns:
         The eight labels of highest probability, [..., 8] uint8, and their probabilities, [..., 8]
-        float32. The highest comes first. Of equal ones, the label with the lower number comes
-        first. If they sum to less than one, the rest of the probability belongs to label `other`.
+        float32. The highest probability comes first. Of two labels with equal probability, the
+        label with the lower number comes first. If the eight probabilities sum to less than one,
+        label `other` has the rest.
     """
     order = np.argsort(-p, axis=-1, kind="stable")[..., :KEPT]
     return order.astype(np.uint8), np.take_along_axis(p, order, axis=-1).astype(np.float32)

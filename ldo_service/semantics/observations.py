@@ -1,4 +1,4 @@
-"""Observations and misses of objects in a keyframe, and the updates of landmarks by them."""
+"""Observations and misses of objects in a keyframe, and the resulting updates of landmarks."""
 
 from dataclasses import dataclass
 
@@ -191,10 +191,11 @@ def neighbors(table: np.ndarray, near: np.ndarray, matched: np.ndarray) -> list[
 
 
 def boxes_overlap(one: np.ndarray, other: np.ndarray, view: MapView, least: float) -> bool:
-    """Return whether the Gaussians of one landmark mostly lie in the box of another landmark.
+    """Return whether either landmark has enough of its Gaussians in the box of the other.
 
-    One fraction is that of the Gaussians of `one` in the box of `other`. The second is that of the
-    Gaussians of `other` in the box of `one`. The larger fraction must be at least `least`.
+    The function compares two fractions: the fraction of the Gaussians of `one` in the box of
+    `other`, and the fraction of the Gaussians of `other` in the box of `one`. The larger fraction
+    must be at least `least`.
 
     Args:
         one: First landmark, as an array with one record of `LANDMARK`.

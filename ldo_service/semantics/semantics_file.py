@@ -7,7 +7,7 @@ weights   [N, 5] float32     five highest probabilities, highest first; backgrou
 ids       [N, 5] uint8       indices of the labels with these probabilities; unused for weight 0
 evidence  [N] float32        sum of the weights of all label observations, decayed with age
 extent_mm [N] uint16         size of the object, mm, when a label was last observed
-misses    [N] uint8          keyframes after this observation that showed the Gaussian in no region
+misses    [N] uint8          keyframes that showed the Gaussian in no region since its last label
 """
 
 from dataclasses import dataclass

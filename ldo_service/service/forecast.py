@@ -106,7 +106,7 @@ class Bound:
 
     @staticmethod
     def of(what: str, consequence: str, trend: Trend, limit: float, unit: str = "") -> "Bound":
-        """Return the bound of a quantity that has the positive upper limit `limit`."""
+        """Return the bound of a quantity whose upper limit is `limit`, a positive number."""
         state = f"{trend.value:,.0f} of {limit:,.0f}{unit}"
         left = 0.0 if trend.value >= REACHED * limit else limit - trend.value
         return Bound(what, consequence, state, left, trend.per_s)

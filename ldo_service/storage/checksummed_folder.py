@@ -98,7 +98,7 @@ class ChecksummedFolder:
         return read_checked(self._path(number))
 
     def remove(self, number: int) -> None:
-        """Remove a file; a failure is logged, and the file then only takes disk space."""
+        """Remove a file; if the removal fails, log the failure and leave the file on the disk."""
         self._sizes.pop(number, None)
         self._unsynced.discard(number)
         self._syncing.discard(number)

@@ -15,7 +15,7 @@ from .state_contents import StateContents, check_of
 
 @dataclass
 class GenerationFiles:
-    """Files of one actor that a generation adds to the disk; any thread may call `write`.
+    """Files that a generation adds to the disk for one actor; any thread may call `write`.
 
     A generation is a copy of the saved states of all actors, to which the service can fall back.
     The generation has its own files, so damage to a file of the current state does not affect the

@@ -21,8 +21,8 @@ UNCHECKED_VERSION = 3
 class StateContents(msgspec.Struct, frozen=True):
     """Files of one state, and their format version.
 
-    The fields `files` and `version` never change, so that an older version of the service can read
-    them and reject a newer state.
+    The names and types of the fields `files` and `version` never change. An older version of the
+    service can therefore read these fields and reject a newer state.
     """
 
     files: dict[str, str]  # File name of each part.

@@ -91,7 +91,7 @@ class FolderStore:
     Each part has a file that is never changed, and `contents.msgpack` lists the files of the
     current state with their sizes and checksums. A changed part is written to a new file. The list
     is replaced last, by one rename. A reader therefore finds the whole old state or the whole new
-    state, or detects the damage.
+    state, or detects a damaged or missing file.
 
     A power cut may damage files that are not synced. `keep` therefore makes a generation: synced
     copies of the files of the current state, with the list `generation-<number>.msgpack`. The
@@ -132,7 +132,7 @@ class FolderStore:
             actor: Name of the actor.
             state: The state.
             unsynced: Files to which the state refers, and which are possibly not synced to the disk
-                yet. The store only saves their paths, for `SavedFiles` to check them later.
+                yet. The store saves their paths; `SavedFiles` checks the files later.
 
         Raises:
             OSError: The state cannot be written; the old state stays unchanged.

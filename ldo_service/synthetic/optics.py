@@ -12,7 +12,7 @@ ITERATIONS = 20  # Each iteration reduces the error by a factor of 3 or more.
 def undistorted(camera: Camera, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the normalized coordinates x, y of the rays through pixels.
 
-    OpenCV's model is inverted by fixed-point iteration with + - * / alone.
+    OpenCV's model is inverted by fixed-point iteration that uses only + - * /.
 
     Args:
         camera: Intrinsics, with at most the coefficients k1, k2, p1, p2, k3.

@@ -97,7 +97,7 @@ SWAY_TARGET_M = 0.03
 
 
 def poses(path: Path, count: int, seed: int) -> np.ndarray:
-    """Return T_world_camera [count, 4, 4] for a round on a path; `seed` sets the hand shake."""
+    """Return T_world_camera [count, 4, 4] for a round on a path; `seed` sets the hand's sway."""
     rng = np.random.default_rng(seed)
     along = np.arange(count) * (len(path.eyes_m) / count)
     eyes = closed_spline(path.eyes_m, along) + _sway(rng, count, SWAY_EYE_M)

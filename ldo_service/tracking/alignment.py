@@ -67,7 +67,7 @@ class ResidualConfig:
 class BrightnessModel:
     """Brightness change and residual noise of a frame relative to its reference keyframe.
 
-    Alignment starts from the default values and estimates all four values with the pose.
+    Alignment starts from the default gain, bias and noise, and estimates them with the pose.
     """
 
     gain: float = 1.0
@@ -194,8 +194,8 @@ class AlignConfig:
         """Return the settings for a camera whose depth bias is uncertain.
 
         Args:
-            relative_sigma: Standard deviation of the bias as a fraction of that of an uncalibrated
-                camera: 0 without a bias, 1 without a calibration; see `CameraKnowledge`.
+            relative_sigma: Standard deviation of the bias, divided by its value for an uncalibrated
+                camera. 0 means no bias, and 1 means no calibration; see `CameraKnowledge`.
         """
         if not relative_sigma:
             return self

@@ -43,10 +43,11 @@ class GpuEquations:
 
     The points, texels and cells of a call stay on the device as long as their arrays exist on the
     host. A call uploads only the arrays that the device lacks, and 100 bytes of parameters. It
-    downloads 51 sums. If `cells` is given, it also downloads 896 gradient values.
+    downloads 51 sums. A call with `cells` also downloads 896 gradient values, 14 for each of the 64
+    possible image cells.
 
-    The results are bitwise equal on one GPU model and one version of Triton. They differ from those
-    of the CPU in the last bits. Residuals whose point, gray level or normal is not finite are
+    The results are bitwise equal on one GPU model and one version of Triton. GPU and CPU
+    results differ in the last bits. Residuals whose point, gray level or normal is not finite are
     excluded from the sums.
 
     Args:

@@ -92,7 +92,7 @@ class KeyframeRecord:
 
     @cached_property
     def features(self) -> Features:
-        """ORB features of the keyframe; their pixels are those of an image of `camera`."""
+        """ORB features of the keyframe, with pixel coordinates in the image of `camera`."""
         points, change = self.points_camera.astype(np.float64), self.change
         points = points if change is None else change.points(points, self.camera)
         return Features(self.camera.project(points), points, self.descriptors)
@@ -109,7 +109,7 @@ class KeyframeRecord:
         return self.__dict__["_across_scales"]
 
     def history(self, otherwise: ResidualHistory) -> ResidualHistory:
-        """Return the residual noise that is usual near this keyframe; `otherwise` if it is unknown.
+        """Return the usual residual noise near this keyframe, or `otherwise` if it is unknown.
 
         Alignments to this keyframe are compared with this noise, because noise differs between
         scenes.

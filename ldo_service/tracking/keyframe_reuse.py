@@ -149,7 +149,7 @@ def find_nearby_keyframes(
     """Return the records near a camera pose, the nearest first.
 
     A record is near if its rotation and translation to the camera are within the limits of
-    `config`. A frame at that pose would not need a new keyframe.
+    `config`. Within these limits, a frame needs no new keyframe.
 
     Args:
         records: Records to choose from; those without a pose in the map are skipped.

@@ -164,8 +164,8 @@ class ReferenceKeyframe:
     ) -> "ReferenceKeyframe":
         """Return the keyframe with a new mask of moved surface, which is ignored from now on.
 
-        Pixels that the keyframe ignored before stay ignored, such as those of people who stood
-        still in the keyframe.
+        Pixels that the keyframe already ignores stay ignored, for example pixels of people who
+        stood still.
 
         Args:
             moved_mask: Pixels whose surface has moved, [H, W] bool at the finest pyramid level.

@@ -23,8 +23,8 @@ class ConstantVelocity:
         """Return T_odom_camera [4, 4] at a stamp, extrapolated with constant velocity.
 
         The result is T_odom_camera * exp(twist * elapsed / interval). Here `elapsed` is the time
-        from the last pose to the stamp, but at most MAX_STEPS intervals. One interval is used if
-        the stamp is not later than the last pose, or if the interval is unknown.
+        from the last pose to the stamp, but at most MAX_STEPS intervals. If the stamp is not later
+        than the last pose, or if the interval is unknown, elapsed / interval is 1.
         """
         elapsed_ns = stamp_ns - self.stamp_ns
         timed = elapsed_ns > 0 and self.interval_ns > 0

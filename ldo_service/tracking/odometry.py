@@ -164,7 +164,7 @@ class Odometry:
         return self._map.correct(correction)
 
     def recorrect(self, change: CorrectionChange) -> None:
-        """Replace the vignetting and depth-bias correction of all keyframe images, but no pose."""
+        """Replace the vignetting and depth-bias correction of all keyframe images; keep poses."""
         state = self._frames.state
         self._frames.restore(state.recorrected(change, self.config.pyramid))
 

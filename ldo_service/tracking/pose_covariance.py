@@ -110,9 +110,9 @@ def contradiction(
     """Return the difference between the poses from color and from depth that noise cannot explain.
 
     The difference is tested along each direction v with H_color v = share (H_color + H_depth) v.
-    Here color has the fraction `share` of the information along v, and depth has the rest. If one
-    of them has a small fraction, its pose has a large variance along v. It then cannot contradict
-    the pose from the other.
+    Here color has the fraction `share` of the information along v, and depth has the rest. A pose
+    from a small fraction of the information has a large variance along v. Such a pose cannot
+    contradict the other pose along v.
 
     Args:
         color_hessian: Hessian of the color residuals for pose, gain and bias, [8, 8].
@@ -121,8 +121,9 @@ def contradiction(
         depth_gradient: Gradient of the depth residuals at the pose, [6].
 
     Returns:
-        The increment xi [6] from the pose by depth to the pose by color, to first order. It has
-        only the directions along which they contradict each other; 0 if there are none.
+        The increment xi [6] from the pose by depth to the pose by color, to first order. The
+        increment has only the directions along which the two poses contradict each other. It is 0
+        if there are none.
     """
     brightness = color_hessian[BRIGHTNESS, BRIGHTNESS] + np.diag(BRIGHTNESS_PRIOR)
     by_brightness = np.linalg.solve(brightness, color_hessian[BRIGHTNESS, POSE])

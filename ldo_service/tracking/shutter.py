@@ -65,10 +65,12 @@ class ShutterConfig:
             )
         positive = "max_interval_s", "sigmas", "max_s", "max_sigma_s", "realign_ratio"
         if not min(getattr(self, name) for name in positive) > 0:
-            raise ConfigError(named(self, *positive) + " must be positive.")
-        least = "min_s", "relinearized_s", "min_motion_rad", "max_linear_ratio"
-        if not min(getattr(self, name) for name in least) >= 0:
-            raise ConfigError(named(self, *least) + ": no value may be negative.")
+            raise ConfigError(named(self, *positive) + ": each of these values must be positive.")
+        not_negative = "min_s", "relinearized_s", "min_motion_rad", "max_linear_ratio"
+        if not min(getattr(self, name) for name in not_negative) >= 0:
+            raise ConfigError(
+                named(self, *not_negative) + ": each of these values must be at least 0."
+            )
 
 
 @dataclass(frozen=True, eq=False, slots=True)

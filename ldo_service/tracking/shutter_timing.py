@@ -3,8 +3,8 @@
 A rolling shutter and a delay between color and depth displace the parts of a frame in proportion to
 the velocity of the camera. The displacement of a row is a twist: the velocity times the time at
 which the row was recorded. This time depends on three constants of the camera: the readout time of
-color, the readout time of depth, and the delay of depth. The three times are thus more unknowns of
-the normal equations of alignment, and are the same for all frames.
+color, the readout time of depth, and the delay of depth. These three times become additional
+unknowns of the normal equations of alignment, and are the same for all frames.
 
 `BandEquations` holds the normal equations of one frame, one set for each band of rows.
 `BandEquations.timing_equations` eliminates pose and exposure, so that only the three times remain
@@ -108,8 +108,8 @@ class BandEquations:
 
         Returns:
             Information matrix and right side, [3, 4], of the three times in seconds. The order of
-            the times is that of `ShutterTiming`. The solution is the full times, even if the frame
-            was compensated with earlier estimates.
+            the times is that of `ShutterTiming`. The solution contains the total times, even if
+            earlier estimates of the times are already compensated in the frame.
         """
         # Velocities of the reference in the camera frame. All twists change T_reference_camera.
         to_camera = se3.adjoint(self.T_camera_reference)
@@ -223,9 +223,10 @@ class TimingEvidence:
         If the frames do not determine a time, the prior determines it. Each variance is the sum of
         two estimates. The first is a jackknife over the groups of successive frames, because
         neighboring frames have similar errors. The second is the inverse of the information,
-        because a jackknife over few groups may be small by chance. With fewer than `MIN_GROUPS`
-        groups, only the prior is used. The result is then None if the self-calibration has not yet
-        replaced the initial prior.
+        because a jackknife over few groups may be small by chance.
+
+        If there are fewer than `MIN_GROUPS` groups, the result is the prior, or None if the
+        self-calibration has not yet replaced the initial prior.
         """
         if len(self.groups) < MIN_GROUPS:
             if np.array_equal(self.prior, PRIOR):

@@ -128,7 +128,7 @@ class SubmapMatch:
     def is_distinct_from(self, other: "SubmapMatch", config: SubmapConfig) -> bool:
         """Return whether the frames of two matches have clearly different camera poses.
 
-        It is then unlikely that both matches are perceptual aliases.
+        Two matches from clearly different camera poses are unlikely to be both perceptual aliases.
         """
         moved = se3.inverse(self.T_here_camera) @ other.T_here_camera
         return image_motion_rad(moved, 3.0 * self.median_depth_m) >= config.confirm_apart_rad

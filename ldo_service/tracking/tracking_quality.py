@@ -1,9 +1,9 @@
 """Tracking status from the quality of an alignment.
 
-The fraction of inliers does not show that alignment converged to a wrong local minimum. The
-estimated residual noise is then so large that every residual counts as an inlier. The status
-therefore depends on other measures: overlap with the reference keyframe, residual noise relative to
-its running median, condition number of the information matrix, and confirmation by ORB features or
+The fraction of inliers cannot detect a wrong local minimum of the alignment. At such a minimum, the
+estimated residual noise is so large that every residual counts as an inlier. The status therefore
+depends on other measures: overlap with the reference keyframe, residual noise relative to its
+running median, condition number of the information matrix, and confirmation by ORB features or
 GICP.
 
 The residual noise of a correct pose grows too: with blur, a change of exposure, a steep viewing
@@ -149,7 +149,7 @@ class ResidualHistory:
     def residual_ratio(self, alignment: Alignment, config: TrackingQualityConfig) -> float:
         """Return the residual noise of an alignment, divided by the running median.
 
-        The result is the larger of two ratios: photometric noise and geometric noise.
+        The result is the larger of two ratios, one for photometric and one for geometric noise.
         """
         intensity, depth = self._usual(config)
         return max(

@@ -79,8 +79,8 @@ class TrackedFrame:
             pose_source: Name of the initial guess that the alignment started from.
             needed_keyframe: Kind of keyframe that the frame should become; None if it should not
                 become one.
-            hypothesis_spread_rad: Distance to the farthest other pose that the images support, as
-                `image_motion_rad`; 0 if there is none.
+            hypothesis_spread_rad: Distance from this pose to the farthest other pose that the
+                images support, computed by `image_motion_rad`; 0 if there is no other pose.
             dynamic_mask: Dynamic pixels, [H, W] bool at the finest pyramid level; None if unknown.
         """
         T_reference_camera, information = alignment.T_reference_camera, alignment.information

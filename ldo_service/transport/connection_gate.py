@@ -11,8 +11,8 @@ limits unproven connections as follows:
 
 - The gate passes nothing on before the first bytes of a TLS handshake have arrived.
 - The gate closes a connection that is unproven for longer than `HANDSHAKE_S`.
-- If more than `MAX_UNPROVEN` connections are unproven, the gate closes one of them. It chooses one
-  of the address that has the most, and prefers a connection that has sent nothing.
+- If more than `MAX_UNPROVEN` connections are unproven, the gate closes one of them. It chooses the
+  address with the most unproven connections, and there prefers one that has sent nothing.
 - At most `MAX_HANDSHAKES` connections of one address are in a handshake with the router at the same
   time. For all addresses together, the limit is `MAX_ALL_HANDSHAKES`.
 
@@ -138,9 +138,9 @@ class Connection:
 
 
 class Side(asyncio.Protocol):
-    """Protocol of one side of the gate: a connection of a client, or one to the router.
+    """Protocol of asyncio for a connection of the gate, from a client or to the router.
 
-    It slows the sender to the receiver's speed.
+    The protocol slows the sender to the receiver's speed.
     """
 
     def __init__(self, gate: "Gate", connection: Connection | None = None) -> None:
@@ -246,7 +246,7 @@ class Gate:
         self._start_waiting()
 
     def end_handshake(self, connection: Connection) -> None:
-        """Count the handshake of a connection as ended, and let the next connection start."""
+        """Count the handshake of a connection as ended, and let the next one start."""
         self._handshakes.pop(connection, None)
         self._start_waiting()
 

@@ -12,14 +12,14 @@
   first message that the producer may not send yet.
 
 Each of these three messages contains the complete state of its sender, not a change of the state.
-It may therefore be lost, repeated or replaced by a newer one.
+A message may therefore be lost, repeated or replaced by a newer one of the same kind.
 
 The producer keeps a message until all consumers have handled it, and waits when a consumer has a
 full window of unhandled messages. It does not wait for a consumer with policy `Backlog`: it stores
 the unhandled messages of such a consumer on disk. The producer retransmits all messages from offset
-`arrived` on in two cases: a credit reports a gap, or that message has not arrived in time. A
-restarted consumer receives the messages that it had not handled. Producer and consumer each save
-their position in one write with the actor's state (`runtime.delivery_state`). Each message
+`arrived` on in two cases: a credit reports a gap, or the message at this offset has not arrived in
+time. A restarted consumer receives the messages that it had not handled. Producer and consumer each
+save their position in one write with the actor's state (`runtime.delivery_state`). Each message
 therefore takes effect exactly once, even if either process is killed at any time. `SequenceTracker`
 counts lost messages by their sequence numbers.
 """

@@ -1,10 +1,10 @@
 """Renewal of the TLS keys of a running router.
 
-Zenoh reads the keys and the access list only when a session opens. If the files change,
-`KeyRenewal` opens a second router with the new files. A Unix socket connects the second router to
-the router of the service. Other programs connect to the gate (`connection_gate`). The gate then
-closes their connections, and passes new connections on to the second router. The programs connect
-again by themselves.
+Zenoh reads the keys and the access list only when a session opens. Other programs connect to the
+router of the service through the gate (`connection_gate`). If the files change, `KeyRenewal` opens
+a second router with the new files. A Unix socket connects the second router to the router of the
+service. The gate then closes the connections of the programs, and passes new connections on to the
+second router. The programs connect again by themselves.
 """
 
 import logging

@@ -103,7 +103,7 @@ class TlsKeys:
         self.context()
 
     def settings(self, router: bool, local_robot: str = "") -> dict[str, Any]:
-        """Return the Zenoh settings of a router or a client, with the path of each as key.
+        """Return the Zenoh settings of a router or a client, with the path of each setting as key.
 
         Args:
             router: True for a router, whose settings include the roles in `access.yaml`.

@@ -62,8 +62,8 @@ def path_lines(positions: np.ndarray, color: Color) -> Lines:
     """Return the path through camera positions, with gaps where the position jumps.
 
     A step between two positions is a jump if it has at least the length JUMP_M, and at least JUMPS
-    times the median length. The second limit is relative, because a long path is drawn with only
-    some of its positions, and its steps are then longer.
+    times the median length. A long path is drawn with only some of its positions, so its steps are
+    longer. The median length adapts the limit to these longer steps.
 
     Args:
         positions: Positions of the camera, [K, 3], meters; NaN where unknown.
@@ -125,7 +125,7 @@ def detection_lines(
 
 
 def box_lines(objects: Iterable[MapObject], color: Color | None = None) -> Lines:
-    """Return the edges of the box of each object; `color_of` its name is the default color."""
+    """Return the edges of each object's box; by default, `color_of(name)` gives their color."""
     return Lines.together(
         Lines.of(
             se3.transform(pose_from_message(one.T_map_object), EDGES * one.size),

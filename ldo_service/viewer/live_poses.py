@@ -28,7 +28,10 @@ class LiveKeyframes:
         self._newer[pose.keyframe] = pose.reference, pose_from_message(pose.T_reference_camera)
 
     def correct(self, correction: GraphCorrection) -> None:
-        """Apply a correction; newer keyframes move with their reference keyframes."""
+        """Apply a pose-graph correction.
+
+        Keyframes that are newer than the correction move with their reference keyframes.
+        """
         T_map = keyframe_poses_from_correction(correction)
         newest = max(T_map, default=-1)
         self._newer = {k: link for k, link in self._newer.items() if k > newest}

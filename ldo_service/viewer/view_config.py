@@ -39,7 +39,7 @@ class ViewerConfig:
 
 
 def viewer_config(settings: ViewerSettings) -> ViewerConfig:
-    """Convert the settings of the viewer to its parameters; the others keep their defaults."""
+    """Convert viewer settings to a `ViewerConfig`, whose other fields keep their defaults."""
     return ViewerConfig(
         address=settings.address,
         port=settings.port,

@@ -126,7 +126,7 @@ def test_damaged_color_is_one_bad_frame(tmp_path: Path) -> None:
         (lambda path: put(path, FORMAT + 8, "I", 2**31), "more than the maximum"),
         (lambda path: put(path, FORMAT + 24, "f", 0.0), r"the depth scale is 0\.0"),
         (lambda path: put(path, FORMAT + 28, "Q", 0), "header announces 0 frames"),
-        (lambda path: put(path, FORMAT + 28, "Q", 2**63), "bytes has 1 to [0-9]+ frames"),
+        (lambda path: put(path, FORMAT + 28, "Q", 2**63), "bytes can have 1 to [0-9]+ frames"),
         (lambda path: put(path, FORMAT + 28, "Q", 5), "truncated in frame 4 of 5"),
         (lambda path: put(path, MATRICES, "f", np.nan), "contain NaN or infinity"),
         (lambda path: put(path, MATRICES + 64, "f", 3.0), "the extrinsics of color"),

@@ -2,8 +2,8 @@
 
 `make gpu-check` runs each kernel in the interpreter of Triton, compares it with the C++ kernels and
 with the NumPy reference implementations, and compiles it for seven architectures. The service
-uses them if `service.device` selects a GPU. Importing this package does not import Triton, but
-importing a module with kernels does.
+uses the kernels if `service.device` selects a GPU. Importing this package does not import Triton,
+but importing a module with kernels does.
 
 - `arithmetic`: exponentials and logarithms, computed with IEEE operations alone.
 - `projection`, `blending`: rendering of the image planes that the loss needs.

@@ -55,7 +55,10 @@ class Arrays(Protocol):
         """Repeat each value as often as its count says; `total` is the sum of the counts."""
 
     def starts(self, ascending: Any, n: int) -> Any:
-        """Return for k = 0 .. n the index int32 of the first value >= k in an ascending array."""
+        """Return, for each k in 0..n, the index of the first value >= k in an ascending array.
+
+        The result is an array [n + 1] int32.
+        """
 
     def peak_bytes(self) -> int:
         """Return the peak GPU memory of the arrays so far, in bytes."""

@@ -57,7 +57,7 @@ class DeviceChoice:
     has_failed: bool = False
 
     def failed(self, error: DeviceError) -> "DeviceChoice":
-        """Return the choice of the CPU that replaces a failed GPU."""
+        """Return the choice that replaces a failed GPU by the CPU."""
         return replace(on_cpu(f"the GPU {self.name} failed: {error}"), has_failed=True)
 
     def metrics(self) -> dict[str, float]:
@@ -66,7 +66,7 @@ class DeviceChoice:
 
 
 def on_cpu(reason: str) -> DeviceChoice:
-    """Return a choice of the CPU, with the reason for it."""
+    """Return the `DeviceChoice` that selects the CPU for the given reason."""
     return DeviceChoice("cpu", reason, isa())
 
 
@@ -80,7 +80,8 @@ def choose_device(
             missing GPU counts as a failure with cuda, but not with auto.
         actor: Actor that uses the device, for the log.
         work: What the device does, such as "the map is fitted", for the log.
-        make: Function that runs the self-test on a GPU and returns what computes on it.
+        make: Function that runs the self-test on a GPU and returns the object that computes on this
+            GPU.
 
     Returns:
         The result of `make` (None if the CPU is chosen), and the choice.

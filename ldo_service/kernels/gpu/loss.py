@@ -28,7 +28,7 @@ C2 = tl.constexpr(0.03 * 0.03)
 
 @triton.jit
 def tap(k: tl.constexpr):
-    """Return the weight of the SSIM window at k pixels from its middle; all 11 add up to 1."""
+    """Return the weight of the SSIM window k pixels from its middle; the 11 weights add up to 1."""
     if k == 0:
         return TAP0
     elif (k == 1) | (k == -1):  # noqa: RET505
@@ -57,9 +57,9 @@ def place_of(width, height, BLOCK: tl.constexpr):
 
 @triton.jit
 def exposed_at(planes, color, mask, exposure, at, channel, pixel, is_live):
-    """Return the values of x and y, whether the mask keeps the pixel, and the gain.
+    """Return the values of images x and y, whether the mask keeps the pixel, and the gain.
 
-    x and y are 0 where the mask is 0; the module describes them.
+    The values are 0 where the mask is 0. The docstring of the module describes x and y.
     """
     counts = is_live & (tl.load(mask + pixel, is_live, 0) != 0)
     gain = tl.load(exposure + channel, is_live, 0.0)

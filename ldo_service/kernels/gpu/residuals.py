@@ -1,6 +1,6 @@
 """Residuals of direct alignment and sums of their normal equations; see `kernels/align.hpp`.
 
-A point has 7 floats: coordinates 0-2, gray level 3, normal 4-6. A texel has 4 floats: gray level,
+A point has 7 floats: coordinates (3), gray level (1), normal (3). A texel has 4 floats: gray level,
 its derivatives along u and v, depth. `tracking.alignment` describes residuals and weights.
 
 A problem has 25 floats: T_camera_reference row by row (12), fx fy cx cy (4), gain, bias, standard
@@ -64,7 +64,7 @@ def store_statistics(out, k, n_programs, used, square, weight):
 
 @triton.jit
 def store_strips(strips, k, n, values, BLOCK: tl.constexpr):
-    """Sum `values` over each strip of 16 consecutive points, and store row k of `strips`."""
+    """Sum `values` over strips of 16 consecutive points; write the sums to row k of `strips`."""
     n_strips = (n + STRIP - 1) // STRIP
     strip = tl.program_id(0) * (BLOCK // STRIP) + tl.arange(0, BLOCK // STRIP)
     sums = tl.sum(tl.reshape(values, [BLOCK // STRIP, STRIP]), 1)

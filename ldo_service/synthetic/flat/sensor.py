@@ -163,7 +163,8 @@ def is_too_dark(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def matching_noise(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
     """Return the disparity noise of a Kinect's block matching, [H, W], of unit variance.
 
-    A Kinect matches windows of pixels, here of WINDOW_PX, so neighbors share most of the noise.
+    A Kinect matches windows of pixels, here of WINDOW_PX, so neighboring pixels share most of
+    the noise.
     """
     shared = _enlarged(normal(rng, _coarse(shape, WINDOW_PX)), WINDOW_PX, shape)
     # Interpolation keeps 2/3 of the variance along each axis, hence the factor 1.5.

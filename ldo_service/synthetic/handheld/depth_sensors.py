@@ -1,6 +1,6 @@
 """Depth cameras: structured light, time of flight and stereo, with a smooth bias.
 
-All functions use + - * / and square roots alone, so results are bitwise equal on every machine.
+All functions use only + - * / and square roots, so results are bitwise equal on every machine.
 """
 
 from dataclasses import dataclass

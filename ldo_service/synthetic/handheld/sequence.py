@@ -96,7 +96,7 @@ class FlatScene:
         T_world_camera: np.ndarray,
         time_s: float,  # noqa: ARG002
     ) -> ExactImages:
-        """Render the flat, which does not change over time; see `Scene.render`."""
+        """Render the furnished flat, which is the same at all times; see `Scene.render`."""
         seen = self._renderer.render(camera, T_world_camera)
         return ExactImages(seen.light, seen.depth_m, seen.class_ids, seen.instance_ids)
 
