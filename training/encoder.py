@@ -214,7 +214,14 @@ def shown_in(
 def example(
     shown: Shown, before: Shown | None, side_px: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Return an augmented crop of `shown`; the object of `before`, if any, may occlude it."""
+    """Return an augmented crop of an object.
+
+    Args:
+        shown: Crop of the object.
+        before: Crop of another object, which is pasted in front of it; None for no occlusion.
+        side_px: Side of the returned crop, pixels.
+        rng: Random number generator.
+    """
     color = recolor(shown.color, shown.plane, rng)
     if before is not None:
         _cover(color, before, rng)

@@ -256,9 +256,10 @@ def color_block(
     """Compare the colors of two views at their common points.
 
     Returns:
-        The linearized measurements of the three color channels, all with weight 1. The pair's own
-        unknowns in each channel are gain and offset of the exposure.
-        None if fewer than MIN_COMMON points are compared.
+        The linearized measurements of the three color channels, all with weight 1. The unknowns of
+        each channel are the vignetting, which all pairs of views share, and gain and offset of the
+        exposure, which belong to this pair alone. The result is None if fewer than MIN_COMMON
+        points are compared.
     """
     is_exposed = first.is_exposed.reshape(-1)[points.in_first]
     is_exposed &= second.is_exposed.reshape(-1)[points.in_second]

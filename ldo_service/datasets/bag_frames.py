@@ -97,7 +97,9 @@ def odometry_topic(bag: BagFile, given: str) -> Topic | None:
 
 
 def read_odometry(bag: BagFile, topic: Topic, camera_frame: str) -> Trajectory | None:
-    """Return `T_odom_camera` of a topic with nav_msgs/Odometry, or None if no message is valid.
+    """Return the odometry of a topic with nav_msgs/Odometry as a trajectory of the camera.
+
+    The result has a pose `T_odom_camera` for each valid message. It is None if no message is valid.
 
     Args:
         bag: The bag.

@@ -291,7 +291,7 @@ class LabelSources:
         return np.array([self.is_labellers(label) for label in range(CAP)])
 
     def pack(self) -> list[list[int]]:
-        """Return the sorted labels by the detector and by the labeller, for a checkpoint."""
+        """Return the labels from the detector and those from the labeller, each list sorted."""
         return [sorted(self.by_detector), sorted(self.by_labeller)]
 
     @staticmethod

@@ -252,7 +252,7 @@ class Pairs:
     def of(
         self, frame: RunFrame, image: RgbdFrame
     ) -> tuple[RunFrame | None, Correspondences | None]:
-        """Find the second frame of the pair that starts with a frame.
+        """Find the second frame of a pair, and the corresponding pixels, from its first frame.
 
         Args:
             frame: The first frame.

@@ -308,17 +308,17 @@ def match_boxes_to_regions(
 ) -> tuple[Foreground | None, ...]:
     """Return the masks of the regions that belong to the detector's boxes.
 
-    `RegionProposal.number` is the index of a region's box. If a segment found by depth and creases
-    fits the box, the mask is this segment. If no segment fits, the mask is the foreground of the
-    box without structural planes. Segments found by color ("flat") are not used, because they
-    include the edge of the surface behind the object.
+    `RegionProposal.number` is the index of a region's box. The mask of a box is the mask of its
+    region: the segment that fits the box, or the foreground of the box if no segment fits. A
+    segment found by color ("flat") is not used, because it includes the edge of the surface behind
+    the object. Its box then has no mask.
 
     Args:
         boxes: Number of boxes.
         found: Regions of the keyframe, from `propose_regions`.
 
     Returns:
-        The mask of each box; None if the box has no region or only a segment found by color.
+        The mask of each box; None if the box has no region, or if its region is "flat".
     """
     parts: list[Foreground | None] = [None] * boxes
     for one in found:

@@ -178,8 +178,9 @@ def refuse_state(folder: Path) -> None:
     """
     if (folder / "state").is_dir():
         raise DataError(
-            f"{folder} holds the state of a service, not a run. Resume the service by "
-            f"`ldo serve --state {folder}`, and give `live` instead of the folder."
+            f"{folder} holds the state of a service, not a run. Start the service by "
+            f"`ldo serve --state {folder}`. Then repeat this command with `live` instead of "
+            "the folder."
         )
 
 

@@ -32,7 +32,7 @@ class Digests:
         self._states = {actor: hashlib.blake2b(digest_size=16) for actor in actors}
 
     def observe(self, actor: str, message: Message) -> None:
-        """Add one output of an actor."""
+        """Update the digest of an actor with one of its outputs."""
         self._counts[actor] += 1
         self._states[actor].update(digest(encode(message)).encode())
 

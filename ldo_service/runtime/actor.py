@@ -37,12 +37,13 @@ class Lossless:
 
 @dataclass(frozen=True, slots=True)
 class Backlog(Lossless):
-    """Policy of a lossless input for which the producer never waits.
+    """Policy of an input that receives every message, although the producer never waits for it.
 
-    The producer stores on disk all messages that the consumer has not handled, up to
-    `supervision.backlog_mb`; beyond this size, it drops the oldest ones. A slow, stopped or dead
-    consumer therefore delays no other actor. When the consumer continues, it receives the stored
-    messages in order. `window` bounds only the consumer's queue in memory.
+    The producer stores the messages that the consumer has not handled on its disk. A slow, stopped
+    or dead consumer therefore delays no other actor. When the consumer continues, it receives the
+    stored messages in order. Messages are lost only if they take more than
+    `supervision.backlog_mb`: the producer then drops the oldest ones. `window` bounds only the
+    consumer's queue in memory.
     """
 
     def __str__(self) -> str:

@@ -66,7 +66,7 @@ def distributions(table: np.ndarray) -> np.ndarray:
 
 
 def labels_of(table: np.ndarray) -> np.ndarray:
-    """Return the most probable label of each landmark that is not background, [K] uint8.
+    """Return the most probable label of each landmark, [K] uint8; background is left out.
 
     `table` has K records of `LANDMARK`, whose labels are sorted by probability.
     """

@@ -156,7 +156,7 @@ class Odometry:
         )
 
     def correct(self, correction: MapCorrection) -> bool:
-        """Apply corrected keyframe poses of the pose graph; poses in odometry do not change.
+        """Correct the map poses of keyframes; their poses in the odometry frame do not change.
 
         Returns:
             True if the correction is newer than the last one. Otherwise it changes nothing.
