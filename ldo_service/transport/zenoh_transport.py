@@ -40,6 +40,11 @@ MAX_QUERIES = 16
 # Maximum number of programs at a router. Each takes a file descriptor; Zenoh's default is 1000.
 MAX_SESSIONS = 256
 CONNECT_WITHIN_MS = 3000
+# Time without a message after which a program closes a connection, milliseconds. While packets are
+# lost, TCP doubles the time to its next attempt, so a new connection continues sooner. With Zenoh's
+# default of 10,000, results sometimes came only 20 s after a cut of the network. A lower value
+# closes more connections if loss and delay are large (docs/benchmarks/faults.md).
+LEASE_MS = 6000
 LEAVE_WITHIN_S = 2.0  # Time to send pending messages when a transport closes.
 
 
@@ -99,6 +104,7 @@ def _session_config(network: Endpoint, router: bool) -> zenoh.Config:
         ],
         **CLOSED,
         "transport/unicast/max_sessions": MAX_SESSIONS,
+        "transport/link/tx/lease": LEASE_MS,
         "transport/link/rx/max_message_size": network.max_message_mb * 1_000_000,
         "connect/timeout_ms": CONNECT_WITHIN_MS,
         **(network.keys.settings(router, network.robot if local else "") if network.keys else {}),

@@ -1,6 +1,7 @@
 """Tests of the runtime over Zenoh on the loopback interface."""
 
 import asyncio
+import json
 import signal
 import subprocess
 import sys
@@ -336,6 +337,17 @@ def test_used_port_and_absent_service_are_reported(network: Endpoint) -> None:
     with pytest.raises(ConfigError, match="no service replies on") as failure:
         open_session(absent)
     assert failure.value.__suppress_context__  # One traceback for the user, not two.
+
+
+@pytest.mark.parametrize("is_router", [False, True])
+def test_connection_without_messages_is_closed_before_tcp_waits_long(
+    network: Endpoint, is_router: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """TCP doubles its waits from 0.2 s on, so the sixth one takes 6.4 s."""
+    opened: list[zenoh.Config] = []
+    monkeypatch.setattr(zenoh, "open", opened.append)
+    open_session(network, router=is_router)
+    assert 0 < json.loads(opened[0].get_json("transport/link/tx/lease")) <= 6400
 
 
 @pytest.mark.parametrize("robot", ["", "a/b", "*", "a b", "$x", "a?", "#", "@"])
