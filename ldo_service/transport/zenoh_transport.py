@@ -45,6 +45,10 @@ CONNECT_WITHIN_MS = 3000
 # default of 10,000, results sometimes came only 20 s after a cut of the network. A lower value
 # closes more connections if loss and delay are large (docs/benchmarks/faults.md).
 LEASE_MS = 6000
+# Maximum time between two attempts of a client to connect, milliseconds. Each attempt takes up to
+# 10 s, and TCP sends nothing in its last 3 s. Zenoh's default of 4000 therefore waited up to 7 s
+# after a long cut (docs/benchmarks/faults.md).
+MAX_RETRY_MS = 1000
 LEAVE_WITHIN_S = 2.0  # Time to send pending messages when a transport closes.
 
 
@@ -107,6 +111,7 @@ def _session_config(network: Endpoint, router: bool) -> zenoh.Config:
         "transport/link/tx/lease": LEASE_MS,
         "transport/link/rx/max_message_size": network.max_message_mb * 1_000_000,
         "connect/timeout_ms": CONNECT_WITHIN_MS,
+        "connect/retry": {"period_max_ms": MAX_RETRY_MS},
         **(network.keys.settings(router, network.robot if local else "") if network.keys else {}),
     }
     config = zenoh.Config()

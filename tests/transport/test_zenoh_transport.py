@@ -350,6 +350,15 @@ def test_connection_without_messages_is_closed_before_tcp_waits_long(
     assert 0 < json.loads(opened[0].get_json("transport/link/tx/lease")) <= 6400
 
 
+def test_client_tries_to_connect_every_second(
+    network: Endpoint, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[zenoh.Config] = []
+    monkeypatch.setattr(zenoh, "open", opened.append)
+    open_session(network)
+    assert json.loads(opened[0].get_json("connect/retry"))["period_max_ms"] == 1000
+
+
 @pytest.mark.parametrize("robot", ["", "a/b", "*", "a b", "$x", "a?", "#", "@"])
 def test_robot_name_invalid_in_topics_is_rejected(robot: str) -> None:
     with pytest.raises(ConfigError, match="robot name"):
