@@ -15,6 +15,7 @@ Properties of zenoh-python 1.x that shape this module:
 import asyncio
 import json
 import logging
+import os
 import time
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
@@ -49,6 +50,10 @@ LEASE_MS = 6000
 # 10 s, and TCP sends nothing in its last 3 s. Zenoh's default of 4000 therefore waited up to 7 s
 # after a long cut (docs/benchmarks/faults.md).
 MAX_RETRY_MS = 1000
+# Threads of Zenoh that receive messages. A closed connection with unsent data blocks one for up to
+# 10 s (SO_LINGER). With Zenoh's default of 2, four broken connections blocked those of all other
+# programs for up to 9 s (docs/benchmarks/faults.md). Zenoh reads this variable at its first use.
+RUNTIME_VARIABLE, RUNTIME = "ZENOH_RUNTIME", "(rx: (worker_threads: 16))"
 LEAVE_WITHIN_S = 2.0  # Time to send pending messages when a transport closes.
 
 
@@ -67,7 +72,7 @@ def open_session(network: Endpoint, router: bool = False) -> zenoh.Session:
             f"endpoint {network.endpoint!r} is malformed: write it like {DEFAULT_ENDPOINT}."
         ) from None
     try:
-        return zenoh.open(config)
+        return _open(config)
     except zenoh.ZError as error:
         advice = why_not_listening(network) if router else _why_not_connected(network)
         raise UnavailableError(f"{advice} ({str(error).split(' at /')[0]})") from None
@@ -90,12 +95,17 @@ def open_front_router(network: Endpoint, keys: TlsKeys, port: int) -> zenoh.Sess
     config.insert_json5("listen/endpoints", json.dumps([listen]))
     config.insert_json5("connect/endpoints", json.dumps([network.local_endpoint]))
     try:
-        return zenoh.open(config)
+        return _open(config)
     except zenoh.ZError as error:
         raise ConfigError(
             f"the router cannot start with the keys in {keys.folder}: {error}. Copy the keys of "
             "this host into the folder again."
         ) from None
+
+
+def _open(config: zenoh.Config) -> zenoh.Session:
+    os.environ.setdefault(RUNTIME_VARIABLE, RUNTIME)
+    return zenoh.open(config)
 
 
 def _session_config(network: Endpoint, router: bool) -> zenoh.Config:

@@ -359,6 +359,25 @@ def test_client_tries_to_connect_every_second(
     assert json.loads(opened[0].get_json("connect/retry"))["period_max_ms"] == 1000
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc exists on Linux only")
+async def test_closing_connections_do_not_occupy_all_receiving_threads() -> None:
+    """Each closing connection with unsent data blocks a thread for up to 10 s."""
+    network = Endpoint("test", f"tcp/127.0.0.1:{free_port()}")
+    program = [sys.executable, str(Path(__file__).with_name("router_process.py"))]
+    router = subprocess.Popen([*program, network.endpoint], stdout=subprocess.PIPE)
+    threads = Path("/proc", str(router.pid), "task")
+    try:
+        assert router.stdout
+        router.stdout.readline()
+        with open_session(network):
+            await eventually(
+                lambda: sum("rx-" in path.read_text() for path in threads.glob("*/comm")) >= 16
+            )
+    finally:
+        router.kill()
+        router.communicate()
+
+
 @pytest.mark.parametrize("robot", ["", "a/b", "*", "a b", "$x", "a?", "#", "@"])
 def test_robot_name_invalid_in_topics_is_rejected(robot: str) -> None:
     with pytest.raises(ConfigError, match="robot name"):
