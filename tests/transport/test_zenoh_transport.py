@@ -8,6 +8,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
+from itertools import pairwise
 from pathlib import Path
 
 import msgpack
@@ -414,6 +416,39 @@ async def test_stopped_router_blocks_no_event_loop_and_loses_nothing() -> None:
     finally:
         router.kill()
         router.communicate()
+
+
+@pytest.mark.slow
+def test_stopped_readers_do_not_stop_the_messages_of_other_programs() -> None:
+    """The router closes the connections of the readers, each with much unsent data."""
+    network = Endpoint("test", f"tcp/127.0.0.1:{free_port()}")
+    came_s: list[float] = []
+    with ExitStack() as stack:
+
+        def start(name: str, *arguments: str) -> "subprocess.Popen[str]":
+            program = [sys.executable, str(Path(__file__).with_name(name)), network.endpoint]
+            process = subprocess.Popen([*program, *arguments], stdout=subprocess.PIPE, text=True)
+            stack.callback(lambda: (process.kill(), process.communicate()))
+            assert process.stdout
+            assert process.stdout.readline() == "up\n"
+            return process
+
+        start("router_process.py")
+        readers = [start("reader_process.py", "large") for _ in range(4)]
+        images, numbers, consumer = (stack.enter_context(open_session(network)) for _ in range(3))
+        handler = zenoh.handlers.Callback(lambda _: came_s.append(time.monotonic()), indirect=False)
+        consumer.declare_subscriber("small", handler)
+        for reader in readers:
+            reader.send_signal(signal.SIGSTOP)
+        until_s = time.monotonic() + 25.0
+        while time.monotonic() < until_s:
+            images.put("large", bytes(1_000_000))
+            numbers.put("small", b"1")
+            time.sleep(0.2)
+        came_s.append(time.monotonic())
+    assert len(came_s) > 1
+    # A blocked router would pass on nothing for 10 s.
+    assert max(after - before for before, after in pairwise(came_s)) < 5.0
 
 
 async def send_images(source: Outlet, values: range) -> None:
