@@ -8,6 +8,7 @@ from enum import Enum
 
 from ldo_service.transport.flow_control import data_key, retransmit_key
 from ldo_service.transport.interface import LastValues, OnMessage, OnPresence
+from ldo_service.transport.zenoh_transport import LEASE_MS
 
 from .virtual_loop import CURRENT, Process, VirtualLoop, is_current_dead
 
@@ -16,12 +17,12 @@ SEND_S = (0.0001, 0.001)
 DELAY_S = (0.0001, 0.003)  # Delay of an undisturbed link, seconds.
 TICK_S = 1e-6  # Minimum time between two messages of a link, so that they stay in order, seconds.
 # Time after which a link that delivers nothing counts as broken, seconds: the lease of Zenoh.
-LEASE_S = 10.0
+LEASE_S = LEASE_MS / 1000
 DRIVER = Context()  # Context of callbacks that belong to no process.
 DISCONNECTED_AFTER_S = 0.05  # Time until the others notice that a process has ended, seconds.
 # Time from the end of a partition of two hosts until their connections that were broken are open
-# again, seconds: the clients of Zenoh wait up to the maximum between two attempts.
-RECONNECT_S = (0.0, 1.2)
+# again, seconds: TCP waits up to 4 s between two attempts to open a connection.
+RECONNECT_S = (0.0, 4.0)
 
 
 class Way(Enum):
