@@ -1,7 +1,9 @@
 """Self-test and failures of the GPU backend, with the interpreter of Triton as the GPU."""
 
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -96,16 +98,18 @@ def config_for(device: str) -> MapBuilderConfig:
 @pytest.mark.slow
 @pytest.mark.timeout(1800)  # It takes three minutes of CPU time.
 def test_keyframe_of_a_lost_device_is_mapped_by_the_cpu(
-    room: Sequence, monkeypatch: pytest.MonkeyPatch, caplog
+    room: Sequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog
 ) -> None:
     arrays = FailingArrays()
     gpu = Gpu("interpreter", {"triton": "3.7.1"}, arrays)
     monkeypatch.setattr("ldo_service.kernels.gpu.device.find_gpu", lambda: gpu)
     monkeypatch.setattr("ldo_service.gaussians.gpu_self_test.run_self_test", lambda _: None)
-    builder, on_cpu = MapBuilder(config_for("auto")), MapBuilder(config_for("cpu"))
+    builder = MapBuilder(config_for("auto"), folder=tmp_path / "gpu")
     add(builder, room, 0)
     assert builder.metrics()["on_gpu"] == 1
     assert builder.fitting.iterations > 0
+    shutil.copytree(tmp_path / "gpu", tmp_path / "cpu")  # The images of the keyframe.
+    on_cpu = MapBuilder(config_for("cpu"), folder=tmp_path / "cpu")
     on_cpu.restore(builder.snapshot())
     assert (on_cpu.metrics()["on_gpu"], on_cpu.metrics()["device_failed"]) == (0, 0)
     assert list(on_cpu.views.store.keyframes()) == [0]
