@@ -153,9 +153,9 @@ class Forecast:
         yield from self.remarks
         bounds = self.reached
         if not bounds:
-            yield "if this goes on, there is no bound within 24 h"
+            yield "if this goes on, no limit is reached within 24 h"
         for bound in bounds:
-            place = "if this goes on, the first bound is" if bound is bounds[0] else "after that,"
+            place = "if this goes on, the first limit is" if bound is bounds[0] else "after that,"
             yield f"{place} {bound}"
 
     def _rates(self) -> str:

@@ -97,7 +97,7 @@ def test_rates_and_times_until_bounds_are_those_of_the_series() -> None:
         "after that, memory, in 2.8 h (5,000 MB available): the operating system may then kill a "
         "process of the service"
     )
-    assert "the first bound is keyframe images on disk, in 51.4 min (1,010 of 4,096" in text(result)
+    assert "the first limit is keyframe images on disk, in 51.4 min (1,010 of 4,096" in text(result)
 
 
 @pytest.mark.parametrize("step", [0.0, -1.0])
@@ -117,7 +117,7 @@ def test_flat_and_shrinking_values_reach_no_bound(step: float) -> None:
     taken = "-120.00 MB of" if step else "no clear amount of"
     assert "no clear rate of keyframes (a longer window may show one)" in text(result)
     assert f"; a minute takes {taken} memory, {taken} disk" in text(result)
-    assert text(result).endswith("if this goes on, there is no bound within 24 h")
+    assert text(result).endswith("if this goes on, no limit is reached within 24 h")
 
 
 def test_noise_without_growth_is_no_trend() -> None:
