@@ -123,8 +123,6 @@ class LosslessInlet(Inlet):
     arrived: int = 0  # Offset of the first message that was not received.
     gap: bool = False  # A message is missing; the producer should retransmit.
     is_connected: bool = False  # The current producer has sent its hello.
-    # Epochs that a newer one replaced. A producer never returns to them, not even after a reset.
-    replaced: set[int] = field(default_factory=set)
 
     @property
     def window(self) -> int:
@@ -135,9 +133,6 @@ class LosslessInlet(Inlet):
     def welcome(self, epoch: int, start: int) -> int:
         """Handle the hello of the producer.
 
-        A hello of a replaced epoch is ignored, because a newer hello has overtaken it. It would set
-        the input back to an earlier run, and its next message would then be handled twice.
-
         Args:
             epoch: Epoch of the producer. A new epoch restarts the numbering.
             start: Offset of the first message that the producer can send.
@@ -145,8 +140,6 @@ class LosslessInlet(Inlet):
         Returns:
             Number of messages that this input has not received and that the producer no longer has.
         """
-        if epoch in self.replaced:
-            return 0
         known, is_connecting = epoch == self.epoch, not self.is_connected
         self.is_connected = True
         if known and start <= self.arrived:
@@ -156,8 +149,6 @@ class LosslessInlet(Inlet):
         self.numbers.add_lost(lost)
         if not (known and self.waiting):  # If messages are queued, `done` advances `handled`.
             self.handled = start
-        if not known and self.epoch:
-            self.replaced.add(self.epoch)
         self.epoch, self.arrived = epoch, start
         self.gap = True  # Request the messages that were sent before the hello.
         return lost

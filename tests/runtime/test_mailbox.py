@@ -3,7 +3,7 @@
 import pytest
 
 from ldo_service.runtime import In, Latest, Lossless
-from ldo_service.runtime.inlet import Delivery, LosslessInlet
+from ldo_service.runtime.inlet import Delivery
 from ldo_service.runtime.mailbox import Mailbox
 from ldo_service.schemas import encode as encode_message
 from ldo_service.schemas.message import LAST_INTEGER
@@ -215,18 +215,3 @@ async def test_queued_messages_are_bounded_by_bytes_and_the_largest_input_gives_
     assert (doubles.queued, doubles.dropped) == (1, 0)
     assert len(mailbox._order) == 3
     mailbox.disconnect()
-
-
-def test_overtaken_hello_of_a_replaced_epoch_does_not_set_the_input_back() -> None:
-    inlet = LosslessInlet(In(NUMBERS, Lossless(4)))
-    inlet.welcome(1, 0)
-    inlet.welcome(2, 0)
-    inlet.reset()
-    inlet.welcome(2, 0)
-    delivery = Delivery(inlet.port, Header("producer", 2, 0, 0), memoryview(b""))
-    assert inlet.accept(delivery.header)
-    assert inlet.welcome(1, 0) == 0
-    inlet.done(delivery, rejected=False)
-    inlet.welcome(2, 0)
-    assert inlet.position(None).handled == 1
-    assert not inlet.accept(delivery.header)
