@@ -1,0 +1,97 @@
+"""Summary of a soak of the live service.
+
+    .venv/bin/python -m tests.faults.soak_summary soak.jsonl
+
+The growth of memory, descriptors and threads is fitted to steady samples. A sample is steady if the
+map has almost all of its keyframes and the last fault is at least 90 s ago.
+"""
+
+import argparse
+import json
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+COMMANDS = ("save", "pause", "refine")
+MEASURED = ("rss_mb", "descriptors", "threads")
+SETTLED_S = 90.0  # Time after a fault whose samples do not count as steady.
+FULL_RATIO = 0.98  # The map counts as complete with this fraction of its final keyframes.
+
+
+def read_lines(path: Path) -> list[dict[str, Any]]:
+    """Return the JSON objects of a file."""
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def growth_per_hour(samples: list[dict[str, Any]], name: str) -> float:
+    """Return the growth per hour by least squares; each set of processes has its own offset."""
+    slopes = spread = 0.0
+    for pids in {tuple(sample["processes"]) for sample in samples}:
+        same = [sample for sample in samples if tuple(sample["processes"]) == pids]
+        hours = np.array([sample["time_s"] / 3600 for sample in same])
+        values = np.array([sample[name] for sample in same])
+        slopes += float(np.sum((hours - hours.mean()) * (values - values.mean())))
+        spread += float(np.sum((hours - hours.mean()) ** 2))
+    return slopes / spread if spread else float("nan")
+
+
+def summary(lines: list[dict[str, Any]]) -> str:
+    """Return the results of a run as text."""
+    by_kind = {
+        kind: [line for line in lines if line["kind"] == kind]
+        for kind in ("sample", "command", "fault", "recovered", "violation")
+    }
+    samples, last = by_kind["sample"], by_kind["sample"][-1]
+    poses, duration_s = sum(last["poses"].values()), last["time_s"]
+    text = [
+        f"{duration_s / 60:.1f} minutes, {last['sent']} frames, {poses} poses, "
+        f"{poses / duration_s:.2f} per second, {last['poses'].get('OK', 0) / poses:.2%} OK: "
+        f"{last['poses']}; at most {last['gap_s']:.1f} s between two poses, "
+        f"{last['ok_gap_s']:.1f} s between two with status OK",
+        *(
+            f"{one['name']}: first OK pose after {one['first_ok_s']} s"
+            for one in by_kind["recovered"]
+        ),
+    ]
+    for name in COMMANDS:
+        took_s = sorted(one["took_s"] for one in by_kind["command"] if one["name"] == name)
+        if took_s:
+            text.append(
+                f"{name}: {len(took_s)}, median {took_s[len(took_s) // 2]}, max {took_s[-1]} s"
+            )
+    pids = {pid for sample in samples for pid in sample["processes"]}
+    text.append(f"{len(pids)} different processes of the service")
+    names = ("restarts", "failures", "dead_lettered", "quarantined", "rejected", "mapper")
+    text.append(", ".join(f"{name} {last[name]}" for name in names))
+    full = FULL_RATIO * max(sample["mapper"].get("keyframes", 0) for sample in samples)
+    complete_s = next(s["time_s"] for s in samples if s["mapper"].get("keyframes", 0) >= full)
+    faults_s = [fault["time_s"] for fault in by_kind["fault"]]
+    steady = [
+        sample
+        for sample in samples
+        if sample["time_s"] >= complete_s
+        and not any(0 <= sample["time_s"] - fault_s <= SETTLED_S for fault_s in faults_s)
+    ]
+    text.append(f"the map is complete after {complete_s:.0f} s; {len(steady)} steady samples")
+    quarters = [i * duration_s / 4 for i in range(1, 5)]
+    for name in MEASURED:
+        means = [
+            np.mean([s[name] for s in samples if start_s <= s["time_s"] <= end_s])
+            for start_s, end_s in pairwise(quarters)
+        ]
+        growth = growth_per_hour(steady, name)
+        shown = ", ".join(f"{mean:.1f}" for mean in means)
+        text.append(f"{name}: means of quarters 2 to 4: {shown}; growth {growth:+.2f} per hour")
+    return "\n".join([*text, *(line["what"] for line in by_kind["violation"])])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("out", type=Path, help="file of the soak")
+    print(summary(read_lines(parser.parse_args().out)))
+
+
+if __name__ == "__main__":
+    main()
