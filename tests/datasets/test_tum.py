@@ -63,7 +63,7 @@ def test_benchmark_recordings_have_their_published_camera(
 
 
 def test_unknown_camera_asks_for_camera_json(tum_folder: Writer) -> None:
-    with pytest.raises(DataError, match=r"camera\.json, such as.*fx"):
+    with pytest.raises(DataError, match=r"camera\.json with content such as.*fx"):
         open_sequence(str(tum_folder(["1"], ["1"], camera=None)))
 
 
