@@ -47,8 +47,8 @@ CONNECT_WITHIN_MS = 3000
 # closes more connections if loss and delay are large (docs/benchmarks/faults.md).
 LEASE_MS = 6000
 # Maximum time between two attempts of a client to connect, milliseconds. Each attempt takes up to
-# 10 s, and TCP sends nothing in its last 3 s. Zenoh's default of 4000 therefore waited up to 7 s
-# after a long cut (docs/benchmarks/faults.md).
+# 10 s, and TCP sends nothing in its last 3 s. With Zenoh's default of 4000, a client therefore
+# waited for up to 7 s after a long cut (docs/benchmarks/faults.md).
 MAX_RETRY_MS = 1000
 # Threads of Zenoh that receive messages. A closed connection with unsent data blocks one for up to
 # 10 s (SO_LINGER). With Zenoh's default of 2, four broken connections blocked those of all other
