@@ -105,9 +105,10 @@ def test_batch_on_two_nodes_survives_the_loss_of_one_and_equals_a_serial_run(
         outcomes.append(outcome)
         if len(outcomes) == count // 4:  # Both nodes are busy with other recordings.
             cluster.remove_node(cluster.worker_nodes.copy().pop(), allow_graceful=False)
-    # A node may be lost after it has published a result, which the repetition then keeps.
-    assert len(outcomes) == count
-    assert {outcome.status for outcome in outcomes} <= {"done", "kept"}
+    # The lost node has one CPU. If it has published its result before, the repetition keeps it.
+    statuses = [outcome.status for outcome in outcomes]
+    assert statuses.count("done") >= count - 1
+    assert statuses.count("done") + statuses.count("kept") == len(statuses) == count
     found = {outcome.source: outcome.digest for outcome in outcomes}
     assert found == {source: process(serial.job(measure(source))).digest for source in sources}
     assert len(set(found.values())) == count
