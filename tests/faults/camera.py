@@ -22,7 +22,7 @@ STRIDE, PERIOD_NS, FIRST_NS = 2, 100_000_000, 1_000_000_000
 def frames() -> list[CameraRgbd]:
     """Return the frames of a way there and back, which repeats without a jump."""
     room = open_sequence("synthetic:room")
-    return _and_back([raw_frame_to_message(_smaller(room.read(i))) for i in _indices(room)])
+    return and_back([raw_frame_to_message(_smaller(room.read(i))) for i in _indices(room)])
 
 
 def true_poses() -> list[np.ndarray]:
@@ -30,14 +30,15 @@ def true_poses() -> list[np.ndarray]:
     room = open_sequence("synthetic:room")
     truth = room.truth()
     assert truth is not None
-    return _and_back([truth.T_world_camera[i] for i in _indices(room)])
+    return and_back([truth.T_world_camera[i] for i in _indices(room)])
 
 
 def _indices(room: Sequence) -> range:
     return range(0, len(room), STRIDE)
 
 
-def _and_back(there: list[Any]) -> list[Any]:
+def and_back(there: list[Any]) -> list[Any]:
+    """Return elements in order and then in reverse order, so that they repeat without a jump."""
     return there + there[-2:0:-1]
 
 

@@ -38,7 +38,7 @@ from ldo_service.transport.keys import TlsKeys
 from ldo_service.transport.zenoh_transport import open_session
 from tests.ports import free_port
 
-from .camera import CameraStream
+from .camera import CameraStream, and_back
 from .service_process import children_of
 from .soak_summary import COMMANDS, MEASURED, read_lines, summary
 
@@ -213,9 +213,8 @@ class Soak:
         self._started_s = time.monotonic()
         self._processes: set[int] = set()
         self._ended_by_fault: set[int] = set()
-        self._releases: list[
-            tuple[float, Callable[[], None]]
-        ] = []  # Time and function that ends a fault.
+        # Time and function that ends a fault.
+        self._releases: list[tuple[float, Callable[[], None]]] = []
 
     def run(self, duration_s: float, fault_every_s: float) -> None:
         """Start the service and the camera, and inject faults for a time."""
@@ -227,7 +226,7 @@ class Soak:
         self.watch = Watch(self.operator, self._stack)
         self.watch.start()
         self._stack.callback(self.watch.stop)
-        self.camera = CameraStream(there + there[-2:0:-1], RATE_HZ)
+        self.camera = CameraStream(and_back(there), RATE_HZ)
         self.camera.start(self.service.connect("camera", self._stack))
         self._stack.callback(self.camera.stop)
         self._started_s = time.monotonic()
@@ -273,7 +272,9 @@ class Soak:
         sizes = self.service.sizes()
         ended = self._processes - sizes.keys() - self._ended_by_fault
         if ended or self.service.process.poll() is not None:
-            self.violation(f"processes {sorted(ended)} ended, and no fault had ended them")
+            self.violation(
+                f"processes {sorted(ended or {self.service.process.pid})} ended without a fault"
+            )
         self._processes = set(sizes)
         total = {name: sum(size[name] for size in sizes.values()) for name in MEASURED}
         self._write("sample", **total, **self.watch.state(), processes=sizes, sent=self.camera.sent)
