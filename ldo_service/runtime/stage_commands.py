@@ -7,6 +7,9 @@ The service sends commands to its stages over a network that may lose messages:
 - `StageReply` (stage to service): Success, or the reason of the failure. The stage sends the reply
   again if the command arrives again.
 
+The numbers of a sender increase. A stage executes no command that is older than the last one of the
+same sender, because the network may deliver commands out of order.
+
 Commands:
 
 - `pause`: Take no messages. Inputs with policy `Latest` drop arriving messages and count them. A
@@ -38,6 +41,10 @@ COMMAND_KEY, REPLY_KEY = "link/command", "link/reply"
 REPEAT_AFTER_S = 0.25
 # Replies that a stage remembers: more than the commands that a service sends at the same time.
 MAX_REPLIES = 8
+# Senders of which a stage remembers the last number. A process of the service has two senders.
+MAX_SENDERS = 8
+COUNT_BITS = 32  # Bits of a number that count the commands of the sender.
+REPLACED = "was replaced by a newer command"
 
 
 What = Literal["pause", "resume", "reset", "save", "keep"]
@@ -46,7 +53,8 @@ What = Literal["pause", "resume", "reset", "save", "keep"]
 class StageCommand(msgspec.Struct, frozen=True, array_like=True):
     """Command to one stage."""
 
-    number: int  # Unique number of the command.
+    # Unique number: the upper bits are a random number of the sender, the lower ones a count.
+    number: int
     what: What  # The command; see the module.
     stage: str  # Name of the stage that executes it.
     # Both are for `keep`: the number of the generation to keep, and of the last complete one.
@@ -65,8 +73,9 @@ class StageReply(msgspec.Struct, frozen=True, array_like=True):
 class CommandReceiver:
     """Receiver of commands in a stage.
 
-    The receiver passes each command to the stage once. If a finished command arrives again, the
-    receiver sends the reply again, because the first reply may be lost.
+    The receiver passes each command to the stage once, unless a newer command of the same sender
+    has arrived. If a finished command arrives again, the receiver sends the reply again, because
+    the first reply may be lost.
     """
 
     def __init__(
@@ -84,6 +93,7 @@ class CommandReceiver:
         # Commands that are waiting or executed, and the last replies, by number.
         self._under_way: set[int] = set()
         self._done: dict[int, StageReply] = {}
+        self._last: dict[int, int] = {}  # Highest number of each sender, by its upper bits.
         self._reports = transport.publisher(REPLY_KEY)
         transport.subscribe(COMMAND_KEY, self._arrived)
 
@@ -109,10 +119,22 @@ class CommandReceiver:
     def _take_once(self, order: StageCommand) -> None:
         if order.number in self._done:
             self._reports.post(b"", encode_link(self._done[order.number]))
-        elif order.number not in self._under_way:
+        elif order.number in self._under_way:
+            pass
+        elif order.number <= self._last.get(order.number >> COUNT_BITS, 0):
+            self.report(order, REPLACED)
+        else:
+            self._remember(order.number)
             self._under_way.add(order.number)
             for replaced in self._take(order):
-                self.report(replaced, "was replaced by a newer command")
+                self.report(replaced, REPLACED)
+
+    def _remember(self, number: int) -> None:
+        """Remember the number as the highest one of its sender."""
+        self._last.pop(number >> COUNT_BITS, None)  # The last senders come last.
+        self._last[number >> COUNT_BITS] = number
+        while len(self._last) > MAX_SENDERS:
+            del self._last[next(iter(self._last))]
 
 
 class CommandSender:
@@ -121,6 +143,7 @@ class CommandSender:
     def __init__(self, transport: Transport) -> None:
         self._loop = asyncio.get_running_loop()
         self._reports: dict[int, asyncio.Future[str]] = {}
+        self._number = (1 + secrets.randbits(30)) << COUNT_BITS  # Number of the last command.
         self._orders = transport.publisher(COMMAND_KEY)
         transport.subscribe(REPLY_KEY, self._arrived)
 
@@ -140,7 +163,8 @@ class CommandSender:
             An empty string on success, otherwise the error message. No reply within `timeout_s`
             counts as an error.
         """
-        order = StageCommand(1 + secrets.randbits(62), what, stage, *generation)
+        self._number += 1
+        order = StageCommand(self._number, what, stage, *generation)
         report = self._reports[order.number] = self._loop.create_future()
         try:
             async with asyncio.timeout(timeout_s):

@@ -12,7 +12,7 @@ from ldo_service.runtime.delivery_state import RestoredState
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage
 from ldo_service.runtime.stage_commands import COMMAND_KEY, CommandSender, StageCommand
-from ldo_service.schemas import Message
+from ldo_service.schemas import Message, decode
 from ldo_service.schemas import encode as encode_message
 from ldo_service.storage.memory_store import MemoryStore
 from ldo_service.storage.state_store import FolderStore, State
@@ -253,6 +253,22 @@ async def test_command_runs_once_although_commands_and_replies_are_lost(
         epochs.append(counter.health().epoch)
         await asyncio.sleep(0.05)
         assert counter.health().epoch == epochs[1] != epochs[0]
+
+
+async def test_late_command_of_a_sender_does_not_undo_a_newer_one() -> None:
+    transport, seen = MemoryTransport(), []
+    stage, commander = collector(transport, seen), CommandSender(transport)
+    sent: list[bytes] = []
+    transport.subscribe(COMMAND_KEY, lambda _, body: sent.append(bytes(body)))
+    async with running(stage):
+        assert await commander.order("resume", "absent", 0.01) != ""
+        late = StageCommand(decode(sent[0], StageCommand).number, "pause", "collector")
+        assert await commander.order("resume", "collector", 60) == ""
+        transport.deliver(COMMAND_KEY, b"", encode_link(late))
+        await asyncio.sleep(0.01)
+        assert not stage.health().paused
+        assert await CommandSender(transport).order("pause", "collector", 60) == ""
+        assert stage.health().paused
 
 
 async def test_missing_reply_is_reported() -> None:
