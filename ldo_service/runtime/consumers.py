@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from ldo_service.transport.flow_control import Credit
+from ldo_service.transport.flow_control import ConsumerHello, Credit
 
 from .actor import UNLIMITED
 
@@ -18,6 +18,7 @@ class Consumer:
     # True: the producer waits for the consumer's credit. False: the consumer has policy Backlog.
     is_awaited: bool = True
     alive: bool = False  # The consumer is connected.
+    nonce: int = 0  # Nonce of the consumer's last hello; 0 before it.
     handled: int = 0  # Offset of the first message that the consumer has not handled.
     arrived: int = 0  # Offset of the first message that the consumer has not received.
     limit: int = 0  # Offset of the first message that exceeds the consumer's window.
@@ -138,23 +139,28 @@ class Consumers:
         """Return the offset of the first message to send to each consumer, by name."""
         return {name: consumer.handled for name, consumer in self._known.items()}
 
-    def join(self, name: str, seq: int, *, has_backlog: bool = False) -> None:
+    def nonces(self) -> dict[str, int]:
+        """Return the nonce of the last hello of each consumer that sent one, by name."""
+        return {name: consumer.nonce for name, consumer in self._known.items() if consumer.nonce}
+
+    def join(self, hello: ConsumerHello, seq: int) -> None:
         """Connect a consumer that sent a hello.
 
         A new consumer starts at the next message. A known consumer receives again all messages that
         it has not handled.
 
         Args:
-            name: Name of the consumer.
+            hello: The hello of the consumer.
             seq: Offset of the producer's next message.
-            has_backlog: True for a consumer with policy `Backlog`.
         """
+        name = hello.consumer
         self._evicted.pop(name, None)
         consumer = self._known.setdefault(name, Consumer(handled=seq))
+        consumer.nonce = hello.nonce or consumer.nonce
         consumer.alive, consumer.shut_since_s, consumer.repeated_from = True, None, -1
         consumer.missing_seq = -1
         consumer.arrived = consumer.limit = consumer.pushed = consumer.handled
-        consumer.is_awaited = not (has_backlog or name in self.with_backlog)
+        consumer.is_awaited = not (hello.has_backlog or name in self.with_backlog)
 
     def note_sent(self, seq: int, now_s: float) -> None:
         """Record that message `seq` was published to all consumers at event-loop time `now_s`.

@@ -11,6 +11,7 @@ from ldo_service.transport.flow_control import (
     Header,
     InletPosition,
     SequenceTracker,
+    new_nonce,
 )
 
 from .actor import Backlog, In, Latest, Lossless
@@ -122,7 +123,8 @@ class LosslessInlet(Inlet):
     handled: int = 0  # Offset of the first message that was not handled.
     arrived: int = 0  # Offset of the first message that was not received.
     gap: bool = False  # A message is missing; the producer should retransmit.
-    is_connected: bool = False  # The current producer has sent its hello.
+    is_connected: bool = False  # The current producer has answered the hello of this input.
+    nonce: int = field(default_factory=new_nonce)  # Number that the next answer must contain.
 
     @property
     def window(self) -> int:
@@ -130,18 +132,28 @@ class LosslessInlet(Inlet):
         assert isinstance(self.port.policy, Lossless)
         return self.port.policy.window
 
-    def welcome(self, epoch: int, start: int) -> int:
+    def welcome(self, epoch: int, start: int, nonce: int) -> int:
         """Handle the hello of the producer.
+
+        A hello with a new epoch may be older than the connection, because the network may deliver
+        messages out of order. The input therefore connects to a new epoch only if the hello
+        contains its nonce. Otherwise the input sends its own hello, which the producer answers.
 
         Args:
             epoch: Epoch of the producer. A new epoch restarts the numbering.
             start: Offset of the first message that the producer can send.
+            nonce: Nonce of the last hello that the producer received from this input; 0 for none.
 
         Returns:
             Number of messages that this input has not received and that the producer no longer has.
         """
         known, is_connecting = epoch == self.epoch, not self.is_connected
+        if not known and nonce != self.nonce:
+            self.is_connected = False
+            return 0
         self.is_connected = True
+        if not known:
+            self.nonce = new_nonce()
         if known and start <= self.arrived:
             self.gap = self.gap or is_connecting
             return 0
@@ -176,6 +188,7 @@ class LosslessInlet(Inlet):
         super().reset()
         self.epoch = self.handled = self.arrived = 0
         self.gap = self.is_connected = False
+        self.nonce = new_nonce()
 
     def _overflow(self, newest: Delivery) -> list[Delivery]:  # noqa: ARG002
         return []  # `accept` enforces the window.
@@ -214,7 +227,7 @@ class LosslessInlet(Inlet):
             waits_for_disk: True if the stage takes no messages because its disk is full.
         """
         if not self.is_connected:
-            return ConsumerHello(consumer, isinstance(self.port.policy, Backlog))
+            return ConsumerHello(consumer, isinstance(self.port.policy, Backlog), self.nonce)
         limit = self.handled + self.window
         where = self.epoch, self.handled, self.arrived, limit
         return Credit(consumer, *where, self.gap, waits_for_disk)

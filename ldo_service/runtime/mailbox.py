@@ -174,7 +174,8 @@ class Mailbox:
         with self._lock:
             if not self._connects:
                 return
-            lost = 0 if start is None else inlet.welcome(welcome.epoch, start)
+            nonce = welcome.nonces.get(self._consumer, 0)
+            lost = 0 if start is None else inlet.welcome(welcome.epoch, start, nonce)
             self._ask_for_grants()
         if lost:
             log.error(

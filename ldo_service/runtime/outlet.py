@@ -232,8 +232,8 @@ class Outlet:
             if name in self._consumers:
                 self._granted(request)
                 return
-        has_backlog = isinstance(request, ConsumerHello) and request.has_backlog
-        self._consumers.join(name, self._seq, has_backlog=has_backlog)
+        hello = request if isinstance(request, ConsumerHello) else ConsumerHello(name)
+        self._consumers.join(hello, self._seq)
         self._consumers.skip(self.outbox.first(self._seq))
         self._post_hellos()
 
@@ -249,8 +249,8 @@ class Outlet:
         self._post_hellos()
 
     def _post_hellos(self) -> None:
-        hello = ProducerHello(self._epoch, self._consumers.next_seq_by_consumer())
-        self._hellos.post(b"", encode_link(hello))
+        starts, nonces = self._consumers.next_seq_by_consumer(), self._consumers.nonces()
+        self._hellos.post(b"", encode_link(ProducerHello(self._epoch, starts, nonces)))
 
     def _granted(self, grant: Credit) -> None:
         if grant.arrived > self._seq:

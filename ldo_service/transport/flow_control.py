@@ -1,11 +1,13 @@
 """Flow control between a producer and its lossless consumers, over a lossy network.
 
-- `ConsumerHello` (consumer to producer): Announces the consumer. It is repeated until the producer
-  sends its hello.
+- `ConsumerHello` (consumer to producer): Announces the consumer with a random number, its nonce. It
+  is repeated until the producer answers it.
 - `ProducerHello` (producer to consumers): Announces the producer. It contains the epoch, which
   changes when the message numbers restart at 0. For each consumer that the producer knows, it
-  contains the offset of the first message that is sent to this consumer. Each consumer replies
-  immediately: with its credit, or with a hello if it is not connected yet.
+  contains the offset of the first message that is sent to this consumer, and the last nonce of
+  this consumer. Each consumer replies immediately: with its credit, or with a hello if it is not
+  connected yet. A consumer connects to a new epoch only if the hello contains its nonce, because
+  other hellos may be older than its connection.
 - `Credit` (consumer to producer): Three message offsets, sent after each handled message and twice
   a second. `handled` is the offset of the first message that the consumer has not handled.
   `arrived` is the offset of the first message that has not arrived. `limit` is the offset of the
@@ -78,6 +80,7 @@ class ConsumerHello(msgspec.Struct, frozen=True, tag="join", array_like=True):
 
     consumer: str
     has_backlog: bool = False  # True: the producer does not wait for the consumer's credit.
+    nonce: int = 0  # Random number, which the producer repeats in its hello.
 
 
 class Credit(msgspec.Struct, frozen=True, tag="grant", array_like=True):
@@ -105,6 +108,7 @@ class ProducerHello(msgspec.Struct, frozen=True, array_like=True):
 
     epoch: int  # Epoch of the producer.
     starts: dict[str, int]  # Offset of the first message for each known consumer, by name.
+    nonces: dict[str, int] = msgspec.field(default_factory=dict)  # Last nonce of each consumer.
 
     def __post_init__(self) -> None:
         if self.epoch <= 0:
@@ -153,6 +157,11 @@ class InletPosition(NamedTuple):
 
 def new_epoch() -> int:
     """Return a new random epoch, which identifies one numbering of a producer's messages."""
+    return 1 + secrets.randbits(62)
+
+
+def new_nonce() -> int:
+    """Return a new random number for the hello of a consumer."""
     return 1 + secrets.randbits(62)
 
 

@@ -248,14 +248,14 @@ async def test_end_of_the_log_lost_in_a_power_cut_stalls_no_consumer(
 
 async def test_queued_messages_before_a_hole_are_handled_again_after_a_kill() -> None:
     inlet = LosslessInlet(In(NUMBERS, Backlog(4)))
-    inlet.welcome(5, 0)
+    inlet.welcome(5, 0, inlet.nonce)
     deliveries = [
         Delivery(inlet.port, Header("producer", 5, seq, 0), memoryview(b"")) for seq in (0, 1, 2)
     ]
     for delivery in deliveries:
         assert inlet.accept(delivery.header)
         inlet.offer(delivery)
-    assert inlet.welcome(5, 200) == 197
+    assert inlet.welcome(5, 200, 0) == 197
     assert inlet.position(None).handled == 0
     for delivery in deliveries:
         inlet.waiting.popleft()

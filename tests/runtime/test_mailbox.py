@@ -3,11 +3,21 @@
 import pytest
 
 from ldo_service.runtime import In, Latest, Lossless
-from ldo_service.runtime.inlet import Delivery
+from ldo_service.runtime.inlet import Delivery, LosslessInlet
 from ldo_service.runtime.mailbox import Mailbox
 from ldo_service.schemas import encode as encode_message
 from ldo_service.schemas.message import LAST_INTEGER
-from ldo_service.transport.flow_control import Header, SequenceTracker, encode_link
+from ldo_service.transport.flow_control import (
+    ConsumerHello,
+    Credit,
+    Header,
+    ProducerHello,
+    SequenceTracker,
+    credit_key,
+    decode_request,
+    encode_link,
+    producer_hello_key,
+)
 from ldo_service.transport.interface import MemoryTransport
 
 from .fake_actors import DOUBLES, NUMBERS, collector, eventually, number, running
@@ -113,7 +123,13 @@ async def test_latest_input_accepts_messages_without_header() -> None:
 async def test_flooded_lossless_input_queues_only_its_window() -> None:
     transport = MemoryTransport()
     mailbox = Mailbox("me", (In(NUMBERS, Lossless(3)),), transport)
-    transport.deliver("link/welcome/test/number", b"", encode_link([1, {"me": 0}]))
+    sent: list[memoryview] = []
+    transport.subscribe(credit_key(NUMBERS.name), lambda _, body: sent.append(body))
+    mailbox.send_credits()
+    asked = decode_request(sent[0])
+    assert isinstance(asked, ConsumerHello)
+    hello = encode_link(ProducerHello(1, {"me": 0}, {"me": asked.nonce}))
+    transport.deliver(producer_hello_key(NUMBERS.name), b"", hello)
     feed = Feed(transport)
     for value in range(100):
         feed.send(value)
@@ -215,3 +231,30 @@ async def test_queued_messages_are_bounded_by_bytes_and_the_largest_input_gives_
     assert (doubles.queued, doubles.dropped) == (1, 0)
     assert len(mailbox._order) == 3
     mailbox.disconnect()
+
+
+def test_late_hello_of_an_earlier_run_does_not_make_an_input_handle_a_message_twice() -> None:
+    inlet = LosslessInlet(In(NUMBERS, Lossless(4)))
+    inlet.welcome(1, 0, old := inlet.nonce)
+    inlet.reset()
+    inlet.welcome(2, 0, inlet.nonce)
+    delivery = Delivery(inlet.port, Header("producer", 2, 0, 0), memoryview(b""))
+    assert inlet.accept(delivery.header)
+    inlet.welcome(1, 0, old)
+    assert isinstance(inlet.grant("consumer"), ConsumerHello)
+    inlet.done(delivery, rejected=False)
+    inlet.welcome(2, 0, inlet.nonce)
+    assert inlet.position(None).handled == 1
+    assert not inlet.accept(delivery.header)
+
+
+def test_input_connects_to_an_earlier_epoch_whose_producer_answers_its_hello() -> None:
+    inlet = LosslessInlet(In(NUMBERS, Lossless(4)))
+    for epoch in (1, 2, 1):
+        inlet.welcome(epoch, 0, 0)
+        hello = inlet.grant("consumer")
+        assert isinstance(hello, ConsumerHello)
+        inlet.welcome(epoch, 0, hello.nonce)
+        credit = inlet.grant("consumer")
+        assert isinstance(credit, Credit)
+        assert credit.epoch == epoch
