@@ -257,6 +257,8 @@ def register_gicp(
     if min(map(len, clouds)) < NEIGHBORS:
         return None
     (there, tree), (here, _) = (_cloud(points, config.spacing * scale_m) for points in clouds)
+    if min(there.size(), here.size()) < NEIGHBORS:
+        return None
     found = small_gicp.align(
         there,
         here,

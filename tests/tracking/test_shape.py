@@ -1,6 +1,7 @@
 """Poses from point clouds, in a scene without texture."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -61,6 +62,18 @@ def test_gicp_finds_nothing_without_depth_or_correspondences(large_room) -> None
     far = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 50.0]))
     view = pyramid_of(white_view(large_room, np.eye(4)), PyramidConfig())
     assert register_gicp(reference, view, far, GicpConfig()) is None
+
+
+def test_gicp_of_few_points_gives_no_pose_and_prints_no_warning(
+    large_room, capfd: pytest.CaptureFixture[str]
+) -> None:
+    view = white_view(large_room, np.eye(4))
+    depth_m = np.zeros_like(view.depth_m)
+    depth_m[40:56, 40:56] = view.depth_m[40:56, 40:56]
+    few = pyramid_of(replace(view, depth_m=depth_m), PyramidConfig())
+    reference = build_reference(pyramid_of(view, PyramidConfig()))
+    assert register_gicp(reference, few, np.eye(4), GicpConfig()) is None
+    assert capfd.readouterr().err == ""
 
 
 def test_gicp_is_bitwise_reproducible(large_room) -> None:
