@@ -1,4 +1,4 @@
-"""Camera that moves to and fro in the synthetic room, at a quarter of its pixels."""
+"""Camera that moves to and fro in the synthetic room."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,10 +19,15 @@ from ldo_service.schemas import CameraRgbd
 STRIDE, PERIOD_NS, FIRST_NS = 2, 100_000_000, 1_000_000_000
 
 
-def frames() -> list[CameraRgbd]:
-    """Return the frames of a way there and back, which repeats without a jump."""
+def frames(*, is_small: bool = True) -> list[CameraRgbd]:
+    """Return the frames of a way there and back, which repeats without a jump.
+
+    Args:
+        is_small: Return frames of 160x120 instead of 320x240.
+    """
     room = open_sequence("synthetic:room")
-    return and_back([raw_frame_to_message(_smaller(room.read(i))) for i in _indices(room)])
+    there = [room.read(i) for i in _indices(room)]
+    return and_back([raw_frame_to_message(_smaller(raw) if is_small else raw) for raw in there])
 
 
 def true_poses() -> list[np.ndarray]:

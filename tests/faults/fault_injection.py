@@ -1,6 +1,10 @@
 """Seeded faults on the real service, and invariants that hold after each.
 
     python -m tests.faults.fault_injection OUT.jsonl [--batches 10] [--faults 20] [--seed 0]
+    python -m tests.faults.fault_injection OUT.jsonl --defaults
+
+With `--defaults`, the service has TLS keys, default settings and frames of 320x240. If it ends
+because its restart budget is used up, it is started again after 5 s, as systemd does.
 
 A batch runs a service on a fresh state folder while a camera moves to and fro. It injects a number
 of faults one after the other. OUT gets a line per fault. Complete batches in OUT are skipped, so an
@@ -87,17 +91,31 @@ class Outcome:
     maps: int = 0  # Number of maps that were compared bit by bit.
     restarts: int = 0  # Number of restarts after which objects and graph were compared bit by bit.
     off_m: float | None = None  # Position error of the last pose.
+    ends: int = 0  # Number of times that the restart budget was used up.
     violations: list[str] = field(default_factory=list)
 
 
 class Batch:
-    def __init__(self, number: int, seed: int, folder: Path, scene: list[CameraRgbd]) -> None:
+    def __init__(
+        self,
+        number: int,
+        seed: int,
+        folder: Path,
+        scene: list[CameraRgbd],
+        *,
+        has_defaults: bool = False,
+    ) -> None:
         self.number, self.rng = number, Random(f"{seed}-{number}")
         self.kinds = APART if number % 2 == 0 else TOGETHER
         self.recorder = MessageRecorder()
         apart = (ALL_APART,) if self.kinds is APART else ()
         synced = (SYNCED,) if number % 4 in (1, 2) else ()  # Some batches of each placement.
-        self.service = ServiceProcess(folder, self.recorder, (*apart, *synced))
+        self.service = ServiceProcess(
+            folder, self.recorder, (*apart, *synced), has_defaults=has_defaults
+        )
+        self.service.on_end = self._start_again
+        # With default settings, a step of any other actor may take ten minutes.
+        self.hanging = ("tracker", "mapper") if has_defaults else STATEFUL
         self.camera = CameraStream(scene, RATE_HZ)
         self.truth = true_poses()
         self.objects = 0  # Number of objects in the map.
@@ -118,7 +136,7 @@ class Batch:
 
     def _inject_fault(self, number: int, *, is_last: bool) -> Outcome:
         self._killed.clear()
-        self.maps = self.restarts = 0
+        self.maps = self.restarts = self.service.ends = 0
         self.off_m = None
         (kind,) = self.rng.choices(list(self.kinds), list(self.kinds.values()))
         outcome = Outcome(self.number, number, kind)
@@ -138,6 +156,7 @@ class Batch:
             self._restart_after_failure()
         outcome.keyframes, outcome.objects = len(self.recorder.keyframes), self.objects
         outcome.maps, outcome.restarts, outcome.off_m = self.maps, self.restarts, self.off_m
+        outcome.ends = self.service.ends
         outcome.violations, self.recorder.violations = self.recorder.violations, []
         return outcome
 
@@ -149,6 +168,12 @@ class Batch:
         self.camera.start(self.service.client)
         with suppress(NotRecovered):
             self._wait_for_recovery()
+
+    def _start_again(self) -> None:
+        self.camera.stop()
+        self.service.close()
+        self.service.start()
+        self.camera.start(self.service.client)
 
     # --- faults -----------------------------------------------------------------------------------
     def _pid(self, actor: str) -> int:
@@ -189,7 +214,7 @@ class Batch:
         self._mark_fault()
 
     def _hang(self, outcome: Outcome) -> None:
-        outcome.what = self.rng.choice(STATEFUL)
+        outcome.what = self.rng.choice(self.hanging)
         self._hang_one(outcome.what)
 
     def _hang_in_main(self, outcome: Outcome) -> None:
@@ -486,7 +511,7 @@ def main() -> int:
     arguments = read_arguments()
     out: Path = arguments.out
     done = whole_batches(out, arguments.faults)
-    scene = frames()
+    scene = frames(is_small=not arguments.defaults)
     for number in range(arguments.first, arguments.first + arguments.batches):
         if number in done:
             continue
@@ -497,7 +522,10 @@ def main() -> int:
                 file.write(json.dumps(asdict(outcome)) + "\n")
                 file.flush()
 
-            Batch(number, arguments.seed, Path(folder), scene).run(arguments.faults, report)
+            batch = Batch(
+                number, arguments.seed, Path(folder), scene, has_defaults=arguments.defaults
+            )
+            batch.run(arguments.faults, report)
     outcomes = [Outcome(**json.loads(line)) for line in out.read_text().splitlines()]
     print(table(outcomes))
     return int(any(outcome.violations for outcome in outcomes))
@@ -520,6 +548,9 @@ def read_arguments() -> argparse.Namespace:
     parser.add_argument("--batches", type=int, default=10)
     parser.add_argument("--faults", type=int, default=20, help="number of faults per batch")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--defaults", action="store_true", help="TLS keys, default settings, frames of 320x240"
+    )
     return parser.parse_args()
 
 
@@ -550,7 +581,8 @@ def table(outcomes: list[Outcome]) -> str:
     lines += [
         "",
         f"compared to the bit: {maps} maps, objects and graph after {restarts} restarts; "
-        f"{len(off_m)} poses at most {100 * max(off_m, default=0):.1f} cm off",
+        f"{len(off_m)} poses at most {100 * max(off_m, default=0):.1f} cm off; restart budget used "
+        f"up {sum(o.ends for o in outcomes)} times",
     ]
     return "\n".join(lines)
 

@@ -22,7 +22,7 @@ from ldo_service.actors.topology import GRAPH
 from ldo_service.client import Client, connect
 from ldo_service.config import actor_parameters, load_config
 from ldo_service.conversions.objects import map_objects
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, StageError
 from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.maps.replica import MapReplica
 from ldo_service.runtime.delivery_state import RestoredState, restore_actor
@@ -30,9 +30,11 @@ from ldo_service.schemas import GraphCorrection, MapObject, MapObjects, MapSnaps
 from ldo_service.schemas.topics import GRAPH_CORRECTION, MAP_OBJECTS, MAP_SNAPSHOT
 from ldo_service.semantics.semantic_map import SemanticMap
 from ldo_service.storage.state_store import FolderStore
+from ldo_service.transport.certificate_authority import CertificateAuthority
 from ldo_service.transport.endpoint import Endpoint
+from ldo_service.transport.keys import TlsKeys
 from ldo_service.transport.zenoh_transport import open_session
-from tests.ports import free_endpoint
+from tests.ports import free_endpoint, free_port
 
 from .message_recorder import MessageRecorder
 
@@ -55,6 +57,8 @@ LIGHT = (  # Little work per keyframe and short timeouts, because the runtime is
     ),
     "detector.model=demo",  # This model finds some objects in the room.
 )
+DEFAULT = ("detector.model=demo",)
+RESTART_S = 5.0  # Time after which systemd starts a failed service again: RestartSec of the unit.
 
 
 class NotRecovered(Exception):
@@ -85,11 +89,35 @@ class PublishedState:
 
 
 class ServiceProcess:
-    """Service that can be started again on the same state after a `kill`."""
+    """Service that can be started again on the same state after a `kill`.
 
-    def __init__(self, folder: Path, recorder: MessageRecorder, settings: tuple[str, ...]) -> None:
+    Attributes:
+        ends: Times that the service ended although nobody had killed it, and was started again as
+            systemd does. This happens only with `has_defaults`.
+        on_end: Function that starts the service again after such an end.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        recorder: MessageRecorder,
+        settings: tuple[str, ...],
+        *,
+        has_defaults: bool = False,
+    ) -> None:
+        """Choose the settings.
+
+        Args:
+            folder: Folder of the state and of the files that switch faults on.
+            recorder: Recorder of the messages.
+            settings: Further settings.
+            has_defaults: Run with default settings and TLS keys, instead of little work per
+                keyframe, short timeouts and no limit of restarts.
+        """
         self.folder, self.recorder = folder, recorder
-        self.settings = (*LIGHT, *settings)
+        self.settings = (*(DEFAULT if has_defaults else LIGHT), *settings)
+        self.keys = _new_keys(folder) if has_defaults else None
+        self.ends, self.on_end = 0, self.start
         self.log: deque[str] = deque(maxlen=400)
         self._stack = ExitStack()
 
@@ -99,8 +127,13 @@ class ServiceProcess:
 
     # --- start and stop ---------------------------------------------------------------------------
     def start(self) -> None:
-        network = Endpoint("robot", free_endpoint())
         settings = [word for setting in self.settings for word in ("--set", setting)]
+        if self.keys is None:
+            network = Endpoint("robot", free_endpoint())
+        else:
+            endpoint = f"tls/127.0.0.1:{free_port()}"
+            network = Endpoint("robot", endpoint, TlsKeys.of(self.keys))
+            settings += ["--keys", str(self.keys)]
         self.process = subprocess.Popen(
             [
                 *(sys.executable, str(PROGRAM), "serve", "--endpoint", network.endpoint),
@@ -126,7 +159,7 @@ class ServiceProcess:
         until_s = time.monotonic() + PATIENCE_S
         while time.monotonic() < until_s and self.process.poll() is None:
             try:
-                return self._stack.enter_context(connect("robot", network.endpoint))
+                return self._stack.enter_context(connect("robot", network.endpoint, self.keys))
             except ConfigError:
                 time.sleep(0.2)
         raise NotRecovered(f"the service does not answer:\n{self.tail()}")
@@ -166,7 +199,11 @@ class ServiceProcess:
             self.recorder.update()
             if true():
                 return time.monotonic() - started_s
-            if self.process.poll() is not None:
+            if self.process.poll() == StageError.exit_code and self.keys is not None:
+                self.ends += 1
+                time.sleep(RESTART_S)
+                self.on_end()
+            elif self.process.poll() is not None:
                 raise NotRecovered(
                     f"the service ended with status {self.process.returncode} before: {what}"
                 )
@@ -220,6 +257,13 @@ class ServiceProcess:
         return PublishedState.of(
             m for m in messages if isinstance(m, MapSnapshot | MapObjects | GraphCorrection)
         )
+
+
+def _new_keys(folder: Path) -> Path:
+    """Create keys for the service, which may use all topics, and return their folder."""
+    authority = CertificateAuthority.new(folder / "keys", days=400)
+    authority.add("service", "service", "robot", days=365)
+    return folder / "keys" / "service"
 
 
 def saved_objects(state: Mapping[str, Any]) -> tuple[MapObject, ...]:
