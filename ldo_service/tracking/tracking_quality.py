@@ -124,9 +124,9 @@ class ResidualHistory:
     def extended(self, alignment: Alignment, config: TrackingQualityConfig) -> "ResidualHistory":
         """Return the history with the residual noise of one more alignment.
 
-        The added noise is limited to `weak_residual` times the running median. The noise of a pose
-        that features confirm may exceed this limit. Without the limit, a few such poses would raise
-        the median, and a wrong pose in a later frame would not stand out.
+        The added noise is limited to `weak_residual` times the running median. Otherwise a few
+        frames with much noise, whose poses features confirm, would raise the median, and a wrong
+        pose in a later frame would not stand out.
         """
         keep, sigma = config.history - 1, exposure_corrected_sigma(alignment)
         usual_sigma, usual_scale = self._usual(config)
