@@ -137,7 +137,8 @@ class LosslessInlet(Inlet):
 
         A hello with a new epoch may be older than the connection, because the network may deliver
         messages out of order. The input therefore connects to a new epoch only if the hello
-        contains its nonce. Otherwise the input sends its own hello, which the producer answers.
+        answers the last hello of this input, which the nonce shows. If it does not, the input sends
+        its own hello again, which the producer answers.
 
         Args:
             epoch: Epoch of the producer. A new epoch restarts the numbering.

@@ -6,8 +6,8 @@
   changes when the message numbers restart at 0. For each consumer that the producer knows, it
   contains the offset of the first message that is sent to this consumer, and the last nonce of
   this consumer. Each consumer replies immediately: with its credit, or with a hello if it is not
-  connected yet. A consumer connects to a new epoch only if the hello contains its nonce, because
-  other hellos may be older than its connection.
+  connected yet. A consumer connects to a new epoch only if the hello contains the last nonce of
+  this consumer, because other hellos may be older than the connection.
 - `Credit` (consumer to producer): Three message offsets, sent after each handled message and twice
   a second. `handled` is the offset of the first message that the consumer has not handled.
   `arrived` is the offset of the first message that has not arrived. `limit` is the offset of the
