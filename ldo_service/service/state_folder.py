@@ -22,6 +22,7 @@ from ldo_service.runtime.generations import (
 )
 from ldo_service.storage.atomic_write import make_folder, sync, write_atomically
 from ldo_service.storage.saved_files import SavedFiles
+from ldo_service.storage.state_contents import require_known_versions
 from ldo_service.storage.state_store import CONTENTS, FolderStore
 
 log = logging.getLogger(__name__)
@@ -120,6 +121,7 @@ def claim_state(folder: Path, stack: ExitStack, remote_actors: Collection[str] =
 def _check_states(folder: Path, remote_actors: Collection[str]) -> None:
     """Check the states in a locked folder, and fall back if they are damaged; see `claim_state`."""
     store = FolderStore(folder / "state")
+    require_known_versions(store.folder)  # Before files are deleted to finish a reset.
     _complete_reset(folder, store, remote_actors)
     found = {path.parent.name for path in store.folder.glob("*/*.msgpack")}
     try:

@@ -1,6 +1,7 @@
 """List of the files of a saved state, with size and checksum of each file."""
 
 import zlib
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +97,22 @@ def read_contents(path: Path) -> StateContents | None:
         raise DamagedStateError(f"{path} is damaged: its {len(body)} bytes do not match their "
                                 "checksum")  # fmt: skip
     return contents
+
+
+def require_known_versions(folder: Path) -> None:
+    """Check that no state, and no generation of a state, is of another version.
+
+    Damaged lists of files are ignored, because `FolderStore.load` reports them.
+
+    Args:
+        folder: Folder of the states of all actors.
+
+    Raises:
+        DataError: Another version of the service wrote a state.
+    """
+    for path in sorted(folder.glob("*/*.msgpack")):
+        with suppress(DamagedStateError, OSError):
+            read_contents(path)
 
 
 def _decode(body: bytes) -> StateContents:

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import pytest
 
 from ldo_service.actors.mapper import Mapper
@@ -23,6 +24,7 @@ from ldo_service.service.state_folder import (
     claim_state,
     state_folder,
 )
+from ldo_service.storage.state_contents import read_contents
 from ldo_service.storage.state_store import CONTENTS, GENERATION, FolderStore
 
 ACTORS = {"tracker": Tracker, "mapper": Mapper, "optimizer": Optimizer}
@@ -175,6 +177,24 @@ def test_interrupted_reset_is_completed_at_the_next_start(tmp_path: Path) -> Non
     store = FolderStore(tmp_path / "state")
     assert [store.load(actor) for actor in (*ACTORS, "loop_closer")] == [None] * 4
     assert not (tmp_path / RESET_MARKER).exists()
+
+
+@pytest.mark.parametrize("marker", [None, RESET_MARKER, FALL_BACK_MARKER])
+@pytest.mark.parametrize("name", [CONTENTS, GENERATION.format(1)])
+def test_folder_of_another_version_is_refused_and_unchanged(
+    tmp_path: Path, marker: str | None, name: str
+) -> None:
+    save_generation_and_newer_states(tmp_path)
+    file = tmp_path / "state" / "mapper" / name
+    contents = read_contents(file)
+    assert contents is not None
+    file.write_bytes(msgspec.structs.replace(contents, version=99).encode())
+    if marker:
+        (tmp_path / marker).touch()
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    with pytest.raises(DataError, match="version=99, and this service reads 3 and 4"):
+        claim(tmp_path)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
 def test_interrupted_reset_of_remote_actors_stays_marked(tmp_path: Path) -> None:
