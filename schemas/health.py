@@ -8,7 +8,7 @@ from ldo_service.schemas.message import Message, require_count, require_finite
 
 
 class InputCount(msgspec.Struct, frozen=True, kw_only=True):
-    """Counters of an input of an actor since the stage, its runtime, started."""
+    """Counters of an input of an actor, from the start of the process of the actor."""
 
     topic: str
     delivered: int  # Messages handled by the actor.
@@ -24,7 +24,7 @@ class InputCount(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class OutputCount(msgspec.Struct, frozen=True, kw_only=True):
-    """Counters of an output of an actor since the stage, its runtime, started."""
+    """Counters of an output of an actor, from the start of the process of the actor."""
 
     topic: str
     sent: int
