@@ -31,6 +31,7 @@ from .pose_covariance import (
     POSE,
     CovarianceConfig,
     contradiction,
+    inverse_of,
     pose_covariance,
     without_brightness,
 )
@@ -312,15 +313,14 @@ def _evaluate(
     """
     T = se3.orthonormalize(T_camera_reference)
     points = reference.points[0]
-    cells = reference.cells
-    e = linearize(points, frame.levels[0], T, appearance, config.residuals, cells)
+    e = linearize(points, frame.levels[0], T, appearance, config.residuals, reference.cells)
     covariance = pose_covariance(e.hessian, e.cells.reshape(-1, 8), config.covariance)
     difference = _contradiction(reference, frame, T, appearance, config.residuals, linearize)
     covariance += np.outer(difference, difference)
     total = max(points.shape[1], 1)
     return Alignment(
         T_reference_camera=se3.inverse(T),
-        information=np.linalg.inv(covariance),
+        information=inverse_of(covariance),
         photometric_inliers=e.photometric.inlier_fraction,
         geometric_inliers=e.geometric.inlier_fraction,
         intensity_sigma=appearance.intensity_sigma,

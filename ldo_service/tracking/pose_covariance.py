@@ -36,6 +36,7 @@ BRIGHTNESS_PRIOR = np.array([1e3, 0.1])
 # Information that is added to the Hessian of the pose: 1 rad and 1 m. It only acts in
 # directions that the residuals do not constrain.
 PRIOR = np.eye(6)
+ROUNDING = 1e-12  # Smallest ratio of two variances with which a covariance can be inverted.
 # Minimum squared difference of color and depth along a direction, divided by its variance, at which
 # they contradict each other. The variance takes all residuals as independent. A frame has such a
 # direction in 10 to 23 % of the frames of exact cameras, and in all frames of a simulated handheld
@@ -99,6 +100,20 @@ def pose_covariance(
     ratio = max(float(np.sum(normalized**2)) / 6, 1.0)
     floor = np.diag([config.floor_rad**2] * 3 + [config.floor_m**2] * 3)
     return config.scale * (errors.T @ errors + ratio * (root.T @ root)) + floor
+
+
+def inverse_of(covariance: np.ndarray) -> np.ndarray:
+    """Return the information matrix [6, 6] of a pose, the inverse of its covariance.
+
+    If color and depth of a frame contradict each other by an absurd amount, one variance is so
+    large that rounding makes the covariance singular. A small fraction of this variance is then
+    added to all directions.
+    """
+    try:
+        return np.linalg.inv(covariance)
+    except np.linalg.LinAlgError:
+        added = ROUNDING * np.diag(covariance).max()
+        return np.linalg.inv(covariance + added * np.eye(len(covariance)))
 
 
 def contradiction(

@@ -7,6 +7,7 @@ from ldo_service.tracking.pose_covariance import (
     BRIGHTNESS_PRIOR,
     CovarianceConfig,
     contradiction,
+    inverse_of,
     pose_covariance,
     without_brightness,
 )
@@ -136,6 +137,15 @@ def test_hessian_that_rounding_makes_indefinite_is_accepted() -> None:
     assert np.isfinite(contradiction(hessian, gradient, hessian[:6, :6], gradient[:6])).all()
     covariance = pose_covariance(hessian, gradient[None], CovarianceConfig())
     assert np.linalg.eigvalsh(covariance)[0] > 0
+
+
+def test_covariance_that_rounding_makes_singular_has_an_information_matrix() -> None:
+    covariance = np.full((6, 6), 1e30) + np.eye(6)
+    with pytest.raises(np.linalg.LinAlgError):
+        np.linalg.inv(covariance)
+    information = inverse_of(covariance)
+    assert np.isfinite(information).all()
+    assert np.linalg.eigvalsh(np.linalg.inv(information))[0] > 0
 
 
 @pytest.mark.slow
