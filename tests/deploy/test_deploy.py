@@ -280,7 +280,7 @@ def test_kustomize_accepts_the_fleet(tmp_path: Path) -> None:
 
 
 def test_fleet_is_valid_against_the_kubernetes_schemas() -> None:
-    schemas = pytest.importorskip("kubernetes_validate", reason="pip install kubernetes-validate")
+    schemas = pytest.importorskip("kubernetes_validate", reason="pip install --group kubernetes")
     for document in read_documents("kubernetes.yaml"):
         schemas.validate(document, schemas.latest_version(), strict=True)
 
