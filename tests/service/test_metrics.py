@@ -153,7 +153,7 @@ def test_actor_that_cannot_save_is_not_ready_and_the_text_says_to_free_disk_spac
     [
         ("mapper", {"current_step_s": 12.0}, "busy with one message for 12 s, with 4 more queued"),
         ("mapper", {"current_step_s": 4.0}, None),
-        ("mapper", {"current_step_s": 12.0, "queued": 0}, None),  # Nothing waits for the step.
+        ("mapper", {"current_step_s": 12.0, "queued": 0}, None),  # The step delays no message.
         ("optimizer", {"current_step_s": 500.0}, None),  # The step limit of a back end is 600 s.
         ("vlm_labeller", {"current_step_s": 500.0, "metrics": {"attempts": 2.0}}, None),
     ],
