@@ -19,6 +19,7 @@ SLOW_STEP_S = 5.0  # Eight times the slowest measured step: mapper with 1.5 mill
 # Maximum time between two steps of an actor, in seconds, if messages are queued or a camera runs.
 # An actor takes a queued message after each step, and a camera sends many frames a second.
 IDLE_S = 5.0
+PAUSED = "is paused and takes no messages: run `ldo control resume` to continue"
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,24 +84,39 @@ def _silent(how_long: str) -> Problem:
 
 
 def _of_steps(health: Health) -> Iterator[Problem]:
-    waiting = _waiting(health)
+    if problem := find_stall(health):
+        yield problem
+
+
+def find_stall(health: Health) -> Problem | None:
+    """Return the problem of an actor that makes no progress; None if it makes progress.
+
+    `ldo doctor` and `/readyz` share this rule. An actor makes no progress during a step of more
+    than `SLOW_STEP_S`, or if it has taken none of its queued messages for `IDLE_S` since its last
+    step. A long step of a back end and a wait for a labelling server are no problem: no other actor
+    waits for them, and their timeouts end them. A paused actor takes no messages on request.
+    """
+    queued = count_queued(health)
     if health.current_step_s > SLOW_STEP_S:
-        if _waits_for_server(health):
-            return
-        if _is_backend(health.actor):
-            return  # `notes` mentions such a step, because no other actor waits for it.
-        yield Problem(
-            f"has been busy with one message for {health.current_step_s:.0f} s",
+        if _waits_for_server(health) or _is_backend(health.actor):
+            return None  # `notes` mentions such a step.
+        others = f", with {queued} more queued" if queued else ""
+        return Problem(
+            f"has been busy with one message for {health.current_step_s:.0f} s{others}",
             "reduce its work per message; after supervision.step_timeout_s the service stops it",
         )
-    elif waiting and not health.current_step_s and health.step_age_s > IDLE_S and not health.paused:
-        yield Problem(
-            f"took none of {waiting} queued messages for {health.step_age_s:.0f} s",
-            "it waits until a consumer takes its outputs; check the actors that consume them",
+    if queued and not health.current_step_s and health.step_age_s > IDLE_S and not health.paused:
+        return Problem(
+            f"took none of {queued} queued messages for {health.step_age_s:.0f} s",
+            "free some disk space, because it cannot save its last step"
+            if health.metrics.get("checkpoint_failing")
+            else "it waits until a consumer takes its outputs; check the actors that consume them",
         )
+    return None
 
 
-def _waiting(health: Health) -> int:
+def count_queued(health: Health) -> int:
+    """Return the number of messages in the mailbox of an actor."""
     return sum(count.queued for count in health.inputs)
 
 
@@ -201,7 +217,7 @@ def notes(seen: ActorStatus) -> Iterator[str]:
         return
     from_camera = [count for count in health.inputs if count.topic.startswith("camera/")]
     if health.paused:
-        yield "is paused and takes no messages: run `ldo control resume` to continue"
+        yield PAUSED
     elif from_camera and sum(count.delivered for count in from_camera) == 0:
         topics = ", ".join(count.topic for count in from_camera)
         yield (
@@ -257,7 +273,7 @@ def _of_answers(health: Health) -> Iterator[str]:
     if _waits_for_server(health) and health.current_step_s > SLOW_STEP_S:
         yield (
             f"has waited for its server for {health.current_step_s:.0f} s, with "
-            f"{_waiting(health)} more regions queued: labels are late, and mapping continues"
+            f"{count_queued(health)} more regions queued: labels are late, and mapping continues"
         )
     if refused := health.metrics.get("answers_refused"):
         questions = health.metrics.get("questions", 0)

@@ -6,6 +6,7 @@ without recent heartbeats has only its counters and the age of its last heartbea
 
 import time
 from collections.abc import Callable, Iterable, Iterator
+from math import inf
 from threading import Lock
 from typing import Any
 
@@ -15,6 +16,8 @@ from prometheus_client.registry import Collector
 
 from ldo_service.schemas import Health, InputCount, OutputCount, decode
 from ldo_service.transport.keys import expiry_warning
+
+from .diagnostics import IDLE_S, PAUSED, count_queued, find_stall
 
 MAX_ACTORS = 64  # Limit of the stored names, because messages may contain any name.
 COMES_BACK_S = 5.0  # Time for an actor to restart after it was killed at its heartbeat timeout.
@@ -144,6 +147,9 @@ class HealthCollector(Collector):
         self._silent_after_s = silent_after_s + COMES_BACK_S
         self._lock = Lock()
         self._last: dict[str, tuple[float, Health]] = {}  # Arrival and heartbeat, by actor.
+        # Time since which each actor has had queued messages and handled none, by actor. The time
+        # is that of the last heartbeat if the actor had none before, or has handled one since.
+        self._queued_since_s: dict[str, float] = {}
         self._begun_anew: dict[str, int] = {}  # Number of process restarts, by actor.
 
     def on_health(self, _header: bytes, body: memoryview) -> None:
@@ -158,7 +164,24 @@ class HealthCollector(Collector):
             _, before = self._last.get(health.actor, (0.0, health))
             self._begun_anew.setdefault(health.actor, 0)
             self._begun_anew[health.actor] += health.pid != before.pid
-            self._last[health.actor] = (time.monotonic(), health)
+            now_s = time.monotonic()
+            if not self._has_waited(health, now_s):
+                self._queued_since_s[health.actor] = now_s
+            self._last[health.actor] = (now_s, health)
+
+    def _has_waited(self, health: Health, now_s: float) -> bool:
+        """Return whether messages have been queued since the last heartbeat and none was handled.
+
+        The result is False after a time without heartbeats, in which this process or that of the
+        actor may have been suspended.
+        """
+        before_s, before = self._last.get(health.actor, (-inf, health))
+        return (
+            now_s - before_s <= IDLE_S
+            and not before.paused
+            and count_queued(before) > 0
+            and _progress(before) == _progress(health)
+        )
 
     def collect(self) -> Iterator[Metric]:
         """Yield all metrics, as Prometheus requires."""
@@ -203,6 +226,35 @@ class HealthCollector(Collector):
         with self._lock:
             return sorted(actor for actor, (_, health) in self._last.items() if health.failing)
 
+    def stalls(self) -> list[str]:
+        """Return a sentence per actor that has queued messages and makes no progress.
+
+        The rule is that of `ldo doctor`. Its step age is too old after a pause of the camera: the
+        first message is then queued or being saved while the last step ended long ago. Messages
+        must therefore have been queued for the same time too.
+        """
+        found = []
+        for health, queued_s in self._current():
+            age_s = min(health.step_age_s, queued_s)
+            stall = find_stall(msgspec.structs.replace(health, step_age_s=age_s))
+            if stall and count_queued(health):
+                found.append(f"{health.actor} {stall}")
+        return found
+
+    def _current(self) -> list[tuple[Health, float]]:
+        """Return the last heartbeat of each actor with a recent heartbeat, sorted by name.
+
+        The second value is the time in seconds for which the actor had handled none of its queued
+        messages when it sent the heartbeat.
+        """
+        since_s = time.monotonic() - self._silent_after_s
+        with self._lock:
+            return [
+                (health, at_s - self._queued_since_s[actor])
+                for actor, (at_s, health) in sorted(self._last.items())
+                if at_s > since_s
+            ]
+
     @staticmethod
     def _ages(last: dict[str, tuple[float, Health]]) -> Metric:
         ages = GaugeMetricFamily(
@@ -235,7 +287,10 @@ class HealthCollector(Collector):
         return age
 
     def warnings(self) -> Iterator[str]:
-        """Yield a description of each problem that does not affect the service yet."""
+        """Yield a sentence per fact that the user should know although the service is ready."""
+        for health, _ in self._current():
+            if health.paused:
+                yield f"{health.actor} {PAUSED}"
         if expiry := expiry_warning(self.certificate_until_s):
             yield f"the certificate of the service {expiry}"
         age_s = self.generation_age_s() if self.generation_age_s else 0.0
@@ -244,6 +299,11 @@ class HealthCollector(Collector):
                 "the generation of the states to which the service falls back is out of date for "
                 f"{age_s:.0f} s, and a power cut could lose the keyframes of this time"
             )
+
+
+def _progress(health: Health) -> tuple[int, ...]:
+    """Return numbers that change if an actor handles or discards a message, or starts again."""
+    return health.pid, health.epoch, health.steps, health.dead_lettered, health.quarantined
 
 
 def _table(

@@ -7,11 +7,12 @@ The server listens on loopback by default.
   counters and the age of its last heartbeat.
 - `/healthz`: Status 200 while every actor sends heartbeats, else 503 with the names of the actors
   without recent heartbeats. The reply describes only the current state.
-- `/readyz`: Status 200 while every actor sends heartbeats and no actor fails on every message, else
-  503 with the names of the actors that are silent or fail. A restart does not help an actor that
-  fails.
-- `/readyz` also warns, with unchanged status, if the certificate expires within 30 days, or if the
-  older copy of the actors' states (generation) is more than a minute out of date.
+- `/readyz`: Status 200 while every actor sends heartbeats, no actor fails on every message, and
+  each actor with queued messages handles them (`find_stall` of diagnostics.py), else 503 with the
+  names of the other actors. A restart does not help an actor that fails.
+- `/readyz` also says, with unchanged status, that an actor is paused, that the certificate expires
+  within 30 days, or that the older copy of the actors' states (generation) is more than a minute
+  out of date.
 """
 
 import socket
@@ -93,10 +94,13 @@ def serve_metrics(collector: HealthCollector, port: int, address: str = LOOPBACK
 
     def answer(environ: Any, start_response: Any) -> Iterable[bytes]:
         if environ["PATH_INFO"] == "/healthz":
-            return _how_it_is(collector.silent_actors(), [], start_response)
+            return _how_it_is(_silence(collector), start_response)
         if environ["PATH_INFO"] == "/readyz":
-            silent, failing = collector.silent_actors(), collector.failing_actors()
-            return _how_it_is(silent, failing, start_response, collector.warnings())
+            failing = collector.failing_actors()
+            problems = _silence(collector)
+            problems += [f"failing on every message: {', '.join(failing)}"] if failing else []
+            problems += collector.stalls()
+            return _how_it_is(problems, start_response, collector.warnings())
         return metrics(environ, start_response)
 
     try:
@@ -120,12 +124,15 @@ def serve_metrics(collector: HealthCollector, port: int, address: str = LOOPBACK
         thread.join()
 
 
+def _silence(collector: HealthCollector) -> list[str]:
+    silent = collector.silent_actors()
+    return [f"no heartbeat: {', '.join(silent)}"] if silent else []
+
+
 def _how_it_is(
-    silent: list[str], failing: list[str], start_response: Any, warnings: Iterable[str] = ()
+    problems: list[str], start_response: Any, warnings: Iterable[str] = ()
 ) -> list[bytes]:
-    status = "503 Service Unavailable" if silent or failing else "200 OK"
+    status = "503 Service Unavailable" if problems else "200 OK"
     start_response(status, [("Content-Type", "text/plain; charset=utf-8")])
-    problems = [f"no heartbeat: {', '.join(silent)}"] if silent else []
-    problems += [f"failing on every message: {', '.join(failing)}"] if failing else []
     state = "; ".join(problems) or "every actor reports"
     return [f"{'; '.join([state, *warnings])}\n".encode()]

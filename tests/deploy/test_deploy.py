@@ -11,6 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 import yaml
 import zenoh
@@ -179,7 +180,9 @@ def test_commands_use_existing_verbs_and_options(
     assert {word.partition("=")[0] for word in arguments if word.startswith("--")} <= available
 
 
-def test_compose_health_check_fails_while_an_actor_is_silent(port: int) -> None:
+def test_compose_health_check_fails_and_says_why_while_an_actor_is_silent_or_fails(
+    port: int,
+) -> None:
     """The check is the one in compose.yaml, run against a collector of one actor."""
     (compose,) = read_documents("compose.yaml")
     service = compose["services"]["service"]
@@ -191,7 +194,12 @@ def test_compose_health_check_fails_while_an_actor_is_silent(port: int) -> None:
     program = program.replace(f":{metrics}/", f":{port}/")
     collector = HealthCollector("mule", ["mapper"])
     with serve_metrics(collector, port):
-        assert subprocess.run([sys.executable, "-c", program], capture_output=True).returncode
+        done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+        assert (done.returncode, done.stderr) == (1, "no heartbeat: mapper\n\n")
+        failing = msgspec.structs.replace(EXAMPLES["health"], failing=True)
+        collector.on_health(b"", memoryview(encode(failing)))
+        done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+        assert (done.returncode, done.stderr) == (1, "failing on every message: mapper\n\n")
         collector.on_health(b"", memoryview(encode(EXAMPLES["health"])))
         subprocess.run([sys.executable, "-c", program], check=True)
 
@@ -272,7 +280,7 @@ def test_kustomize_accepts_the_fleet(tmp_path: Path) -> None:
 
 
 def test_fleet_is_valid_against_the_kubernetes_schemas() -> None:
-    schemas = pytest.importorskip("kubernetes_validate", reason="pip install kubernetes-validate")
+    schemas = pytest.importorskip("kubernetes_validate", reason="pip install --group kubernetes")
     for document in read_documents("kubernetes.yaml"):
         schemas.validate(document, schemas.latest_version(), strict=True)
 

@@ -59,7 +59,7 @@ def test_healthy_actor_has_no_findings(actor: ActorStatus) -> None:
         (status(health(), has_token=False), "token is absent"),
         (
             status(health(current_step_s=12.0, inputs=inputs(queued=1))),
-            "busy with one message for 12 s",
+            "busy with one message for 12 s, with 1 more queued",
         ),
         (
             status(health(current_step_s=12.0, metrics={"labellers": 1.0})),  # It uses no server.

@@ -85,6 +85,135 @@ def test_readyz_names_an_actor_that_fails_on_every_message_and_healthz_does_not(
             assert read_healthz(port) == (200, "every actor reports")
 
 
+class Beats:
+    """Collector that receives made-up heartbeats of one actor, twice a second."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, actor: str) -> None:
+        self.collector = HealthCollector("mule", [actor])
+        self._health = msgspec.structs.replace(EXAMPLES["health"], actor=actor)
+        self._now_s = time.monotonic()
+        monkeypatch.setattr("ldo_service.service.metrics.time.monotonic", lambda: self._now_s)
+
+    def hear(self, seconds: float, *, queued: int = 4, is_handling: bool = False, **fields) -> None:
+        """Receive heartbeats for a time, with `queued` messages; `is_handling` counts steps."""
+        count = msgspec.structs.replace(self._health.inputs[0], queued=queued)
+        for _ in range(round(2 * seconds)):
+            self._now_s += 0.5
+            steps = self._health.steps + is_handling
+            values = {"steps": steps, "current_step_s": 0.0, "inputs": (count,), **fields}
+            self._health = msgspec.structs.replace(self._health, **values)
+            self.collector.on_health(b"", memoryview(encode(self._health)))
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass without a heartbeat."""
+        self._now_s += seconds
+
+
+def test_readyz_names_an_actor_that_takes_none_of_its_queued_messages_and_healthz_does_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    beats, port = Beats(monkeypatch, "mapper"), free_port()
+    with serve_metrics(beats.collector, port):
+        beats.hear(10, is_handling=True, step_age_s=0.1)
+        assert read_healthz(port, "readyz") == (200, "every actor reports")
+        beats.hear(8, step_age_s=8.0)
+        assert read_healthz(port, "readyz") == (
+            503,
+            "mapper took none of 4 queued messages for 8 s: it waits until a consumer takes its "
+            "outputs; check the actors that consume them",
+        )
+        assert read_healthz(port) == (200, "every actor reports")
+        beats.hear(0.5, is_handling=True, step_age_s=0.1)
+        assert read_healthz(port, "readyz") == (200, "every actor reports")
+
+
+def test_actor_makes_no_progress_only_after_the_time_that_doctor_allows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    beats = Beats(monkeypatch, "optimizer")
+    beats.hear(1, is_handling=True, step_age_s=0.1)
+    beats.hear(4.5, step_age_s=5.0)
+    assert beats.collector.stalls() == []
+    beats.hear(1, step_age_s=6.0)
+    (text,) = beats.collector.stalls()
+    assert text.startswith("optimizer took none of 4 queued messages for 6 s")
+
+
+def test_actor_that_cannot_save_is_not_ready_and_the_text_says_to_free_disk_space(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    beats = Beats(monkeypatch, "mapper")
+    beats.hear(8, step_age_s=8.0, metrics={"checkpoint_failing": 1.0})
+    (text,) = beats.collector.stalls()
+    assert text.endswith(": free some disk space, because it cannot save its last step")
+
+
+@pytest.mark.parametrize(
+    ("actor", "fields", "text"),
+    [
+        ("mapper", {"current_step_s": 12.0}, "busy with one message for 12 s, with 4 more queued"),
+        ("mapper", {"current_step_s": 4.0}, None),
+        ("mapper", {"current_step_s": 12.0, "queued": 0}, None),  # The step delays no message.
+        ("optimizer", {"current_step_s": 500.0}, None),  # The step limit of a back end is 600 s.
+        ("vlm_labeller", {"current_step_s": 500.0, "metrics": {"attempts": 2.0}}, None),
+    ],
+)
+def test_long_step_makes_the_service_not_ready_only_if_poses_or_the_map_wait_for_it(
+    monkeypatch: pytest.MonkeyPatch, actor: str, fields: dict, text: str | None
+) -> None:
+    beats = Beats(monkeypatch, actor)
+    beats.hear(20, step_age_s=20.0, **fields)
+    assert [text in stall for stall in beats.collector.stalls()] == ([True] if text else [])
+
+
+def test_readyz_says_that_the_service_is_paused_and_stays_ready(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    beats, port = Beats(monkeypatch, "frame_source"), free_port()
+    beats.hear(60, paused=True, step_age_s=60.0)
+    with serve_metrics(beats.collector, port):
+        status, text = read_healthz(port, "readyz")
+        assert status == 200
+        assert text == (
+            "every actor reports; frame_source is paused and takes no messages: run `ldo control "
+            "resume` to continue"
+        )
+    beats.hear(1, paused=False, step_age_s=61.0)
+    assert beats.collector.stalls() == [], "it had no time to take a message since the pause"
+
+
+def test_first_message_after_a_time_without_a_camera_is_no_missing_progress(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    beats = Beats(monkeypatch, "mapper")
+    beats.hear(60, queued=0, step_age_s=60.0)
+    beats.hear(2, step_age_s=62.0)  # The actor saves its first step.
+    assert beats.collector.stalls() == []
+
+
+def test_time_without_heartbeats_and_old_heartbeats_are_no_missing_progress(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    beats = Beats(monkeypatch, "mapper")
+    beats.hear(1, step_age_s=0.1)
+    beats.wait(600)  # The machine was suspended.
+    beats.hear(1, step_age_s=600.0)
+    assert beats.collector.stalls() == []
+    beats.hear(8, step_age_s=608.0)
+    assert len(beats.collector.stalls()) == 1
+    beats.wait(10 + COMES_BACK_S)
+    assert beats.collector.stalls() == [], "the actor is silent"
+
+
+def test_actor_that_discards_each_message_is_failing_instead_of_without_progress(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    beats = Beats(monkeypatch, "mapper")
+    for dead_lettered in range(10):
+        beats.hear(1, step_age_s=60.0, dead_lettered=dead_lettered, failing=True)
+    assert (beats.collector.stalls(), beats.collector.failing_actors()) == ([], ["mapper"])
+
+
 def test_certificate_that_expires_within_30_days_is_a_metric_and_a_warning_of_readyz() -> None:
     collector, port = HealthCollector("mule", ["mapper"]), free_port()
     collector.on_health(b"", memoryview(encode(EXAMPLES["health"])))

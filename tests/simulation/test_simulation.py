@@ -21,7 +21,7 @@ from ldo_service.transport.flow_control import Credit
 from . import two_hosts
 from .simulation import simulate
 
-SEEDS, SEEDS_PER_TEST = 100, 20
+SEEDS, SEEDS_PER_TEST = 200, 20
 # Seeds of which one has to show a fault of the runtime whose correction is taken out.
 SEARCHED_SEEDS = 60
 
