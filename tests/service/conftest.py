@@ -6,11 +6,12 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from itertools import count, cycle
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import msgspec
@@ -22,6 +23,7 @@ from ldo_service.conversions.frames import raw_frame_to_message
 from ldo_service.errors import ConfigError
 from ldo_service.geometry.sequence import Sequence as FrameSequence
 from ldo_service.schemas import CameraRgbd, Health, TrackedPose
+from ldo_service.transport.access_control import LOCAL
 from tests.ports import free_endpoint
 
 PATIENCE = 6  # Factor on all time limits, because test machines are busy with other work.
@@ -45,8 +47,33 @@ def wait_until(true: Callable[[], bool], timeout_s: float, what: str) -> None:
 class LiveService:
     """Process of `ldo serve`, its log, and a client that receives health and poses."""
 
-    def __init__(self, folder: Path, *arguments: str, command: Sequence[str] = LDO) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *arguments: str,
+        command: Sequence[str] = LDO,
+        keys: Path | None = None,
+        variables: Mapping[str, str] | None = None,
+    ) -> None:
+        """Start the service and connect to it.
+
+        Args:
+            folder: Folder of the log and of the state.
+            arguments: Further arguments of `ldo serve`.
+            command: The command `ldo`.
+            keys: Folder with TLS keys of a service. The client then connects over the Unix socket
+                of the service, which needs no keys.
+            variables: Further environment variables.
+        """
         self.endpoint, self.state = free_endpoint(), folder / "s"
+        self._stack = ExitStack()
+        environment = {**os.environ, **(variables or {})}
+        self._temporary = None  # Folder of the Unix socket, whose path has at most 107 characters.
+        if keys is not None:
+            self.endpoint = self.endpoint.replace("tcp/", "tls/")
+            arguments = (*arguments, "--keys", str(keys))
+            self._temporary = Path(self._stack.enter_context(TemporaryDirectory()))
+            environment["TMPDIR"] = str(self._temporary)
         self.log_path = folder / "serve.log"
         self._log = self.log_path.open("w")
         self.process = subprocess.Popen(
@@ -60,8 +87,8 @@ class LiveService:
                 *arguments,
             ],
             stderr=self._log,
+            env=environment,
         )
-        self._stack = ExitStack()
         self.health: dict[str, Health] = {}
         try:
             self.client = self._connect()
@@ -77,12 +104,18 @@ class LiveService:
     def log(self) -> str:
         return self.log_path.read_text()
 
+    @property
+    def _address(self) -> str:
+        if self._temporary is None:
+            return self.endpoint
+        return f"{LOCAL}/{next(self._temporary.glob('ldo-*/link'), self._temporary)}"
+
     def _connect(self) -> Client:
         """Connect as soon as the router listens; an attempt before that fails at once."""
         until_s = time.monotonic() + PATIENCE * 20
         while True:
             try:
-                return self._stack.enter_context(connect("robot", self.endpoint))
+                return self._stack.enter_context(connect("robot", self._address))
             except ConfigError:
                 assert self.process.poll() is None, self.log
                 assert time.monotonic() < until_s, f"the service does not answer:\n{self.log}"
@@ -219,9 +252,9 @@ def _end(program: subprocess.Popen[Any]) -> None:
 
 @contextmanager
 def live_service(
-    folder: Path, *arguments: str, command: Sequence[str] = LDO
+    folder: Path, *arguments: str, command: Sequence[str] = LDO, **options: Any
 ) -> Iterator[LiveService]:
-    service = LiveService(folder, *arguments, command=command)
+    service = LiveService(folder, *arguments, command=command, **options)
     try:
         yield service
     finally:
