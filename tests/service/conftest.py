@@ -67,13 +67,12 @@ class LiveService:
         """
         self.endpoint, self.state = free_endpoint(), folder / "s"
         self._stack = ExitStack()
-        environment = {**os.environ, **(variables or {})}
-        self._temporary = None  # Folder of the Unix socket, whose path has at most 107 characters.
+        self._address = self.endpoint  # Address to which the client connects.
         if keys is not None:
             self.endpoint = self.endpoint.replace("tcp/", "tls/")
-            arguments = (*arguments, "--keys", str(keys))
-            self._temporary = Path(self._stack.enter_context(TemporaryDirectory()))
-            environment["TMPDIR"] = str(self._temporary)
+            socket = f"{self._stack.enter_context(TemporaryDirectory())}/link"
+            arguments = (*arguments, "--keys", str(keys), "--local-socket", socket)
+            self._address = f"{LOCAL}/{socket}"
         self.log_path = folder / "serve.log"
         self._log = self.log_path.open("w")
         self.process = subprocess.Popen(
@@ -87,7 +86,7 @@ class LiveService:
                 *arguments,
             ],
             stderr=self._log,
-            env=environment,
+            env={**os.environ, **(variables or {})},
         )
         self.health: dict[str, Health] = {}
         try:
@@ -103,12 +102,6 @@ class LiveService:
     @property
     def log(self) -> str:
         return self.log_path.read_text()
-
-    @property
-    def _address(self) -> str:
-        if self._temporary is None:
-            return self.endpoint
-        return f"{LOCAL}/{next(self._temporary.glob('ldo-*/link'), self._temporary)}"
 
     def _connect(self) -> Client:
         """Connect as soon as the router listens; an attempt before that fails at once."""

@@ -33,6 +33,7 @@ class Camera:
 
     def __init__(self, service: LiveService) -> None:
         self._service, self._scene, self.sent = service, frames(), 0
+        wait_until(lambda: service.client.has_subscriber, 20, "a subscriber of camera frames")
 
     def send(self, clock_offset_s: int = 0) -> CameraRgbd:
         """Send the next frame, stamped by a clock with an offset, and return it."""
