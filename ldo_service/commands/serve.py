@@ -9,11 +9,12 @@ from typing import Annotated
 import tyro
 
 from ldo_service.config import load_config
+from ldo_service.errors import ConfigError
 from ldo_service.service.service import Service
 from ldo_service.service.state_folder import state_folder
 from ldo_service.transport.access_control import LOCAL
 from ldo_service.transport.endpoint import DEFAULT_ENDPOINT, Endpoint
-from ldo_service.transport.keys import OF_SERVICE, TlsKeys
+from ldo_service.transport.keys import OF_SERVICE, OTHERS, TlsKeys
 
 from .options import (
     ActorNames,
@@ -32,8 +33,18 @@ from .options import (
     with_preset,
 )
 
+MAX_SOCKET_PATH = 107  # Maximum length of the path of a Unix socket on Linux, bytes.
+
 Insecure = Annotated[
     bool, argument(help="listen on the network without keys: anyone there can control the service")
+]
+LocalSocket = Annotated[
+    Path | None,
+    argument(
+        metavar="PATH",
+        help="with --keys, Unix socket for programs on this machine, in a folder that other users "
+        "cannot access; they use --endpoint unixsock-stream/PATH without keys",
+    ),
 ]
 Client = Annotated[bool, argument(help="connect to the router at ADDRESS instead of opening one")]
 MetricsPort = Annotated[
@@ -59,6 +70,7 @@ def serve(
     ] = None,
     keys: KeysFolder = None,
     insecure: Insecure = False,
+    local_socket: LocalSocket = None,
     client: Client = False,
     metrics_port: MetricsPort = None,
     preset: Preset = "",
@@ -80,12 +92,14 @@ def serve(
     is_router = not (actor or client)
     if is_router and not insecure:
         network.require_safe()
+    if local_socket is not None:
+        local_socket = _usable_socket(local_socket, is_router and network.keys is not None)
     with ExitStack() as stack:
         folder = state_folder(state, stack)
         if is_router and network.keys:
             network.keys.warn_of_expiry(OF_SERVICE)
             private = stack.enter_context(TemporaryDirectory(prefix="ldo-"))  # Mode 0700.
-            network = replace(network, local_socket=f"{private}/link")
+            network = replace(network, local_socket=str(local_socket or f"{private}/link"))
         Service(
             settings,
             network,
@@ -114,6 +128,7 @@ def record(
     localize: Localize = None,
     keys: KeysFolder = None,
     insecure: Insecure = False,
+    local_socket: LocalSocket = None,
     client: Client = False,
     metrics_port: MetricsPort = None,
     preset: Preset = "",
@@ -136,8 +151,42 @@ def record(
         record=out,
         keys=keys,
         insecure=insecure,
+        local_socket=local_socket,
         client=client,
         metrics_port=metrics_port,
         preset=preset,
         device=device,
     )
+
+
+def _usable_socket(path: Path, is_router_with_keys: bool) -> Path:
+    """Return the absolute path of the Unix socket of a service.
+
+    Raises:
+        ConfigError: The service opens no socket, or the path cannot be used.
+    """
+    path = path.expanduser().resolve()
+    if not is_router_with_keys:
+        raise ConfigError(
+            "--local-socket needs --keys, and a service that opens its own router. Without keys, "
+            "programs on this machine use the address of --endpoint."
+        )
+    if len(str(path).encode()) > MAX_SOCKET_PATH or any(c in str(path) for c in "?#"):
+        raise ConfigError(
+            f"--local-socket {path} must have at most {MAX_SOCKET_PATH} bytes and must not contain "
+            "? or #. Choose another path."
+        )
+    try:
+        mode = path.parent.stat().st_mode
+    except OSError as error:
+        raise ConfigError(
+            f"--local-socket {path}: the folder {path.parent} cannot be used: {error.strerror}. "
+            f"Create it by `mkdir -m 700 {path.parent}`."
+        ) from error
+    if mode & OTHERS:
+        raise ConfigError(
+            f"--local-socket {path}: all users of this machine can access the folder "
+            f"{path.parent}, and the socket needs no keys. Run `chmod o= {path.parent}`, or choose "
+            "another folder."
+        )
+    return path

@@ -137,6 +137,12 @@ def test_prometheus_scrapes_the_metrics_port_of_the_unit() -> None:
     assert f"LDO_METRICS_PORT={target.rpartition(':')[2]}\n" in unit
 
 
+def test_local_socket_of_the_unit_is_in_a_private_folder() -> None:
+    unit = UNIT.read_text()
+    assert "--local-socket /run/ldo/%i/link" in unit
+    assert "RuntimeDirectory=ldo/%i\nRuntimeDirectoryMode=0700" in unit
+
+
 def test_each_robot_of_a_machine_can_have_ports_of_its_own() -> None:
     lines = UNIT.read_text().splitlines()
     (start,) = [line for line in lines if line.startswith("ExecStart=")]

@@ -6,11 +6,12 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from itertools import count, cycle
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import msgspec
@@ -22,6 +23,7 @@ from ldo_service.conversions.frames import raw_frame_to_message
 from ldo_service.errors import ConfigError
 from ldo_service.geometry.sequence import Sequence as FrameSequence
 from ldo_service.schemas import CameraRgbd, Health, TrackedPose
+from ldo_service.transport.access_control import LOCAL
 from tests.ports import free_endpoint
 
 PATIENCE = 6  # Factor on all time limits, because test machines are busy with other work.
@@ -45,8 +47,32 @@ def wait_until(true: Callable[[], bool], timeout_s: float, what: str) -> None:
 class LiveService:
     """Process of `ldo serve`, its log, and a client that receives health and poses."""
 
-    def __init__(self, folder: Path, *arguments: str, command: Sequence[str] = LDO) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *arguments: str,
+        command: Sequence[str] = LDO,
+        keys: Path | None = None,
+        variables: Mapping[str, str] | None = None,
+    ) -> None:
+        """Start the service and connect to it.
+
+        Args:
+            folder: Folder of the log and of the state.
+            arguments: Further arguments of `ldo serve`.
+            command: The command `ldo`.
+            keys: Folder with TLS keys of a service. The client then connects over the Unix socket
+                of the service, which needs no keys.
+            variables: Further environment variables.
+        """
         self.endpoint, self.state = free_endpoint(), folder / "s"
+        self._stack = ExitStack()
+        self._address = self.endpoint  # Address to which the client connects.
+        if keys is not None:
+            self.endpoint = self.endpoint.replace("tcp/", "tls/")
+            socket = f"{self._stack.enter_context(TemporaryDirectory())}/link"
+            arguments = (*arguments, "--keys", str(keys), "--local-socket", socket)
+            self._address = f"{LOCAL}/{socket}"
         self.log_path = folder / "serve.log"
         self._log = self.log_path.open("w")
         self.process = subprocess.Popen(
@@ -60,8 +86,8 @@ class LiveService:
                 *arguments,
             ],
             stderr=self._log,
+            env={**os.environ, **(variables or {})},
         )
-        self._stack = ExitStack()
         self.health: dict[str, Health] = {}
         try:
             self.client = self._connect()
@@ -82,7 +108,7 @@ class LiveService:
         until_s = time.monotonic() + PATIENCE * 20
         while True:
             try:
-                return self._stack.enter_context(connect("robot", self.endpoint))
+                return self._stack.enter_context(connect("robot", self._address))
             except ConfigError:
                 assert self.process.poll() is None, self.log
                 assert time.monotonic() < until_s, f"the service does not answer:\n{self.log}"
@@ -219,9 +245,9 @@ def _end(program: subprocess.Popen[Any]) -> None:
 
 @contextmanager
 def live_service(
-    folder: Path, *arguments: str, command: Sequence[str] = LDO
+    folder: Path, *arguments: str, command: Sequence[str] = LDO, **options: Any
 ) -> Iterator[LiveService]:
-    service = LiveService(folder, *arguments, command=command)
+    service = LiveService(folder, *arguments, command=command, **options)
     try:
         yield service
     finally:
