@@ -25,7 +25,7 @@ from .zenoh_transport import open_front_router
 
 log = logging.getLogger(__name__)
 
-Stamps = tuple[tuple[int, ...], ...]  # Number, time and size of each file.
+Stamps = tuple[tuple[int, ...], ...]  # Number, time, size and access rights of each file.
 
 
 class KeyRenewal:
@@ -112,7 +112,8 @@ def _stamps(folder: Path) -> Stamps:
     for name in (CA, CERTIFICATE, KEY, ACCESS):
         try:
             status = (folder / name).stat()
-            found.append((status.st_ino, status.st_mtime_ns, status.st_size))
+            rights = (status.st_mode, status.st_uid, status.st_gid)
+            found.append((status.st_ino, status.st_mtime_ns, status.st_size, *rights))
         except OSError:
             found.append(())
     return tuple(found)

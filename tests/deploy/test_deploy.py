@@ -1,6 +1,7 @@
 """Tests that the files in deploy/ match the code and are valid for their tools."""
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -9,6 +10,7 @@ import tomllib
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import msgspec
@@ -26,6 +28,7 @@ from ldo_service.service.metrics import HealthCollector
 from ldo_service.service.metrics_server import serve_metrics
 from ldo_service.transport.access_control import read_access, rules_of
 from ldo_service.transport.certificate_authority import CertificateAuthority
+from ldo_service.transport.keys import TlsKeys
 from tests.ports import free_port
 from tests.schemas.examples import EXAMPLES
 
@@ -150,6 +153,43 @@ def test_each_robot_of_a_machine_can_have_ports_of_its_own() -> None:
     assert "--metrics-port ${LDO_METRICS_PORT}" in start
     assert re.findall(r":\d+|port \d+", start) == [], "the command fixes no port"
     assert "EnvironmentFile=-/etc/ldo/%i.env" in lines, "a file of the robot replaces the ports"
+
+
+def test_unit_reads_keys_that_root_replaces_and_no_other_user_reads() -> None:
+    """Run the commands of deploy.md with a group that exists, and read the files as two users."""
+    lines = UNIT.read_text().splitlines()
+    (start,) = [line for line in lines if line.startswith("ExecStart=")]
+    (group,) = [line.partition("=")[2] for line in lines if line.startswith("SupplementaryGroups=")]
+    folder = start.split("--keys ")[1].split()[0]
+    assert not [line for line in lines if line.startswith("LoadCredential")], "copied at the start"
+    page = (DEPLOY.parent / "docs" / "deploy.md").read_text()
+    assert f"groupadd --system {group}\n" in page
+    found = re.findall(rf"^install .*-g {group} .*{folder}.*?(?=\s+#)", page, re.MULTILINE)
+    assert len(found) == 3, "the folder, the first keys, and renewed keys"
+    gid = 54_321 if os.geteuid() == 0 else os.getegid()
+    with TemporaryDirectory() as parent:
+        os.chmod(parent, 0o755)
+        authority = CertificateAuthority.new(Path(parent) / "authority", days=2)
+        for name in ("mule", "mule-2"):
+            authority.add(name, "service", "mule", days=1)
+        keys = Path(parent) / "keys"
+        before = b""
+        for command in found:
+            command = command.replace(group, str(gid)).replace(folder, str(keys))
+            subprocess.run(command, shell=True, check=True, cwd=authority.folder)
+            files = [keys / "ca.crt", keys / "tls.crt", keys / "tls.key", keys / "access.yaml"]
+            if not files[0].exists():
+                continue
+            assert before != files[2].read_bytes(), "the second command replaces the key"
+            before = files[2].read_bytes()
+            TlsKeys(keys)
+            assert {file.stat().st_mode & 0o777 for file in files} == {0o640}
+            assert (keys.stat().st_mode & 0o777, keys.stat().st_gid) == (0o750, gid)
+            if os.geteuid() == 0:
+                read = ["cat", *map(str, files)]
+                user: dict[str, Any] = {"user": 54_322, "group": 54_322, "capture_output": True}
+                subprocess.run(read, check=True, extra_groups=[gid], **user)
+                assert subprocess.run(read, extra_groups=[], **user).returncode != 0
 
 
 # --- commands -------------------------------------------------------------------------------------

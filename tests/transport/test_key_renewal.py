@@ -3,7 +3,7 @@
 import shutil
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -129,6 +129,55 @@ def test_unusable_new_keys_leave_the_previous_ones_in_use(
         eventually(lambda: "cannot be used, so the previous ones stay in use" in caplog.text)
         eventually(arrives(router, camera, CAMERA_RGBD.name))
     assert not router.renewed
+
+
+def test_corrected_mode_of_a_private_key_is_noticed(
+    router: RunningRouter, caplog: pytest.LogCaptureFixture
+) -> None:
+    router.authority.add("mule-40", "service", "robot", days=40)
+    (router.used / KEY).chmod(0o644)
+    router.install("mule-40", CERTIFICATE, KEY, ACCESS)
+    eventually(lambda: "is readable by all users" in caplog.text)
+    assert not router.renewed
+    (router.used / KEY).chmod(0o640)
+    eventually(lambda: router.renewed)
+
+
+def test_client_uses_replaced_keys_when_it_connects_again(tmp_path: Path) -> None:
+    """A service with `--client` is such a client; the router starts again with a new list."""
+    authority = CertificateAuthority.new(tmp_path / "keys", days=60)
+    for name in ("router", "mule"):
+        authority.add(name, "service", "robot", days=20)
+    endpoint, arrived = f"tls/{LOOPBACK}:{free_port()}", []
+    used = shutil.copytree(authority.folder / "mule", tmp_path / "mule")
+
+    @contextmanager
+    def open_router() -> Iterator[None]:
+        keys = TlsKeys(authority.folder / "router")
+        with open_session(Endpoint("robot", endpoint, keys), router=True) as session:
+            session.declare_subscriber(
+                f"{PREFIX}/{MAP_REFINE.name}",
+                zenoh.handlers.Callback(arrived.append, indirect=False),
+            )
+            yield
+
+    with ExitStack() as stack:
+        with open_router():
+            service = stack.enter_context(open_session(Endpoint("robot", endpoint, TlsKeys(used))))
+
+            def arrives_now() -> bool:
+                service.put(f"{PREFIX}/{MAP_REFINE.name}", b"1")
+                return bool(arrived)
+
+            eventually(arrives_now)
+            authority.remove("mule")
+            authority.add("mule-2", "service", "robot", days=20)
+            for file in (CERTIFICATE, KEY):
+                shutil.copyfile(authority.folder / "mule-2" / file, used / file)
+            shutil.copyfile(authority.folder / ACCESS, authority.folder / "router" / ACCESS)
+        arrived.clear()
+        stack.enter_context(open_router())
+        eventually(arrives_now)
 
 
 def test_keys_are_looked_at_again_after_an_unexpected_error(
