@@ -6,11 +6,16 @@
 #include <cmath>
 #include <cstring>
 
+#include "simd.hpp"
+
 namespace ldo::align {
 namespace {
 
+using ldo::LDO_ISA::Floats;
+using ldo::LDO_ISA::kLanes;
+using ldo::LDO_ISA::kRegisters;
+
 constexpr int kBlock = 256;
-constexpr int kLanes = 16;
 // Degrees of freedom of the t-distribution (Kerl et al. 2013, III.B).
 constexpr float kDegrees = 5.0f;
 constexpr float kInlierSigma = 3.0f;
@@ -121,11 +126,13 @@ std::int64_t points(const float* texels, const float* normals, int width, int he
 
 // Intermediate values of one block of points; rows of kBlock floats.
 struct alignas(64) Block {
-  float point[kPointRows][kBlock];        // Reference frame, as stored.
+  const float* point[kPointRows];         // Reference frame, as stored.
+  float last[kPointRows][kBlock];         // Points of the last block, filled up with zeros.
   float x[kBlock], y[kBlock], z[kBlock];  // Target camera frame.
-  float du[kBlock], dv[kBlock];           // Fractions of the bilinear sample.
-  int corner[kBlock], nearest[kBlock];    // Texel indices.
-  float column[kBlock], row[kBlock];      // Nearest pixel.
+  float inverse_z[kBlock];
+  float du[kBlock], dv[kBlock];         // Fractions of the bilinear sample.
+  int corner[kBlock], nearest[kBlock];  // Texel indices.
+  float column[kBlock], row[kBlock];    // Nearest pixel.
   float visible[kBlock];
   float intensity[kBlock], gradient_u[kBlock], gradient_v[kBlock], depth[kBlock];
   // sqrt(w) [J | r] of the photometric residuals, then of the geometric residuals.
@@ -136,18 +143,24 @@ struct alignas(64) Block {
 
 void load(const Problem& p, std::int64_t first, Block& b) {
   const std::int64_t left = p.count - first;
-  const int n = left < kBlock ? static_cast<int>(left) : kBlock;
   for (int k = 0; k < kPointRows; ++k) {
-    std::memcpy(b.point[k], p.points + k * p.count + first, sizeof(float) * n);
-    if (n < kBlock) std::memset(b.point[k] + n, 0, sizeof(float) * (kBlock - n));
+    const float* values = p.points + k * p.count + first;
+    b.point[k] = values;
+    if (left >= kBlock) continue;
+    const int n = static_cast<int>(left);
+    std::memcpy(b.last[k], values, sizeof(float) * n);
+    std::memset(b.last[k] + n, 0, sizeof(float) * (kBlock - n));
+    b.point[k] = b.last[k];
   }
 }
 
 void project(const Problem& p, Block& b) {
   const float* T = p.T_camera_reference;
   const float right = p.width - 2.0f, bottom = p.height - 2.0f;
+  const float *points_x = b.point[kX], *points_y = b.point[kY], *points_z = b.point[kZ];
+#pragma GCC ivdep
   for (int i = 0; i < kBlock; ++i) {
-    const float X = b.point[kX][i], Y = b.point[kY][i], Z = b.point[kZ][i];
+    const float X = points_x[i], Y = points_y[i], Z = points_z[i];
     const float x = T[0] * X + T[1] * Y + T[2] * Z + T[3];
     const float y = T[4] * X + T[5] * Y + T[6] * Z + T[7];
     const float z = T[8] * X + T[9] * Y + T[10] * Z + T[11];
@@ -160,6 +173,7 @@ void project(const Problem& p, Block& b) {
     const int iu = static_cast<int>(su), iv = static_cast<int>(sv);
     const int nu = static_cast<int>(su + 0.5f), nv = static_cast<int>(sv + 0.5f);
     b.x[i] = x, b.y[i] = y, b.z[i] = in_front ? z : 1.0f;
+    b.inverse_z[i] = inverse;
     b.du[i] = su - iu, b.dv[i] = sv - iv;
     b.corner[i] = iv * p.width + iu, b.nearest[i] = nv * p.width + nu;
     b.column[i] = static_cast<float>(nu), b.row[i] = static_cast<float>(nv);
@@ -167,24 +181,49 @@ void project(const Problem& p, Block& b) {
   }
 }
 
+typedef float Four __attribute__((vector_size(16)));
+static_assert(kTexelSize == 4);
+
+Four texel(const float* p) {
+  Four values;
+  std::memcpy(&values, p, sizeof values);
+  return values;
+}
+
+Four lower(Four a, Four b) { return a < b ? a : b; }
+
+// Interpolate a texel between the four pixels around a point. The result has intensity and
+// gradients. In place of the depth, it has the lowest intensity of the four pixels.
+Four interpolated(const float* above, const float* below, float du, float dv) {
+  const Four a = texel(above), b = texel(above + kTexelSize);
+  const Four c = texel(below), d = texel(below + kTexelSize);
+  const Four upper = a + du * (b - a), lower_row = c + du * (d - c);
+  const Four mixed = upper + dv * (lower_row - upper);
+  return __builtin_shufflevector(mixed, lower(lower(a, b), lower(c, d)), 0, 1, 2, 4);
+}
+
+void store(Four values, float* p) { std::memcpy(p, &values, sizeof values); }
+
 void sample(const Problem& p, Block& b) {
-  const std::int64_t below = static_cast<std::int64_t>(kTexelSize) * p.width;
-  for (int i = 0; i < kBlock; ++i) {
-    const float* a = p.target + static_cast<std::int64_t>(kTexelSize) * b.corner[i];
-    const float* c = a + below;
-    const float du = b.du[i], dv = b.dv[i];
-    float mixed[kTexelSize];
-    for (int k = 0; k < kTexelSize; ++k) {
-      const float upper = a[k] + du * (a[k + kTexelSize] - a[k]);
-      const float lower = c[k] + du * (c[k + kTexelSize] - c[k]);
-      mixed[k] = upper + dv * (lower - upper);
+  const std::int64_t row = static_cast<std::int64_t>(kTexelSize) * p.width;
+  for (int i = 0; i < kBlock; i += 4) {
+    Four t[4];
+#pragma GCC unroll 4
+    for (int k = 0; k < 4; ++k) {
+      const float* above = p.target + static_cast<std::int64_t>(kTexelSize) * b.corner[i + k];
+      t[k] = interpolated(above, above + row, b.du[i + k], b.dv[i + k]);
+      b.depth[i + k] = p.target[static_cast<std::int64_t>(kTexelSize) * b.nearest[i + k] + kDepth];
     }
-    const float darkest = smaller(smaller(a[kIntensity], a[kTexelSize + kIntensity]),
-                                  smaller(c[kIntensity], c[kTexelSize + kIntensity]));
-    b.intensity[i] = darkest > 0 ? mixed[kIntensity] : 0.0f;
-    b.gradient_u[i] = mixed[kGradientU];
-    b.gradient_v[i] = mixed[kGradientV];
-    b.depth[i] = p.target[static_cast<std::int64_t>(kTexelSize) * b.nearest[i] + kDepth];
+    // Transpose the four results.
+    const Four front = __builtin_shufflevector(t[0], t[1], 0, 4, 1, 5);
+    const Four front_rest = __builtin_shufflevector(t[0], t[1], 2, 6, 3, 7);
+    const Four back = __builtin_shufflevector(t[2], t[3], 0, 4, 1, 5);
+    const Four back_rest = __builtin_shufflevector(t[2], t[3], 2, 6, 3, 7);
+    const Four intensity = __builtin_shufflevector(front, back, 0, 1, 4, 5);
+    const Four darkest = __builtin_shufflevector(front_rest, back_rest, 2, 3, 6, 7);
+    store(darkest > 0 ? intensity : Four{}, b.intensity + i);
+    store(__builtin_shufflevector(front, back, 2, 3, 6, 7), b.gradient_u + i);
+    store(__builtin_shufflevector(front_rest, back_rest, 0, 1, 4, 5), b.gradient_v + i);
   }
 }
 
@@ -194,15 +233,17 @@ float robust_weight(float square) { return (kDegrees + 1.0f) / (kDegrees + squar
 // perturbation T_reference_camera exp(xi) moves a point by dp = skew(p) omega - v.
 void weigh_photometric(const Problem& p, Block& b) {
   const float inverse_sigma = 1.0f / p.intensity_sigma;
+  const float* shades = b.point[kShade];
+#pragma GCC ivdep
   for (int i = 0; i < kBlock; ++i) {
-    const float x = b.x[i], y = b.y[i], z = b.z[i], inverse = 1.0f / z, seen = b.depth[i];
+    const float x = b.x[i], y = b.y[i], z = b.z[i], inverse = b.inverse_z[i], seen = b.depth[i];
     const bool hidden = (seen > 0) & (z > seen * (1.0f + p.occlusion));
     const float used = hidden ? 0.0f : b.visible[i];
     b.visible[i] = used;
     const float gx = b.gradient_u[i] * p.camera.fx * inverse;
     const float gy = b.gradient_v[i] * p.camera.fy * inverse;
     const float gz = -(gx * x + gy * y) * inverse;
-    const float shade = b.point[kShade][i];
+    const float shade = shades[i];
     const float compared = (shade > 0) & (b.intensity[i] > 0) ? used : 0.0f;
     const float r = b.intensity[i] - p.gain * shade - p.bias;
     const float normalized = r * inverse_sigma, square = normalized * normalized;
@@ -228,8 +269,11 @@ void weigh_photometric(const Problem& p, Block& b) {
 void weigh_geometric(const Problem& p, Block& b) {
   const float* T = p.T_camera_reference;
   const float ifx = 1.0f / p.camera.fx, ify = 1.0f / p.camera.fy;
+  const float *normals_x = b.point[kNormalX], *normals_y = b.point[kNormalY],
+              *normals_z = b.point[kNormalZ];
+#pragma GCC ivdep
   for (int i = 0; i < kBlock; ++i) {
-    const float mx = b.point[kNormalX][i], my = b.point[kNormalY][i], mz = b.point[kNormalZ][i];
+    const float mx = normals_x[i], my = normals_y[i], mz = normals_z[i];
     const float nx = T[0] * mx + T[1] * my + T[2] * mz;
     const float ny = T[4] * mx + T[5] * my + T[6] * mz;
     const float nz = T[8] * mx + T[9] * my + T[10] * mz;
@@ -260,39 +304,64 @@ void weigh_geometric(const Problem& p, Block& b) {
   }
 }
 
-// Add the lanes pairwise in a fixed order, independent of the machine's vector width.
-float folded(float* lanes) {
-  for (int half = kLanes / 2; half > 0; half /= 2)
-    for (int l = 0; l < half; ++l) lanes[l] += lanes[l + half];
-  return lanes[0];
-}
-
+// Return the sum of n products a b. Sixteen partial sums are added pairwise, in an order that does
+// not depend on the machine's vector width.
 double dot(const float* a, const float* b, int n) {
-  float lanes[kLanes] = {};
-  for (int i = 0; i < n; i += kLanes)
-    for (int l = 0; l < kLanes; ++l) lanes[l] += a[i + l] * b[i + l];
-  return folded(lanes);
+  Floats lanes(0.0f);
+  for (int i = 0; i < n; i += kLanes) lanes = lanes + Floats::load(a + i) * Floats::load(b + i);
+  return ldo::LDO_ISA::sum(lanes);
 }
 
 double sum(const float* a) {
-  float lanes[kLanes] = {};
-  for (int i = 0; i < kBlock; i += kLanes)
-    for (int l = 0; l < kLanes; ++l) lanes[l] += a[i + l];
-  return folded(lanes);
+  Floats lanes(0.0f);
+  for (int i = 0; i < kBlock; i += kLanes) lanes = lanes + Floats::load(a + i);
+  return ldo::LDO_ISA::sum(lanes);
+}
+
+// Number of products with one row that are summed at once: as many as the registers hold.
+constexpr int kColumns = kRegisters == 1 ? 9 : 5;
+
+// Add the products of the row R with the columns C to C + N - 1 to the equations. A load of the row
+// then serves N products. Geometric residuals do not depend on gain and bias.
+template <int R, int C, int N>
+[[gnu::always_inline]] inline void accumulate_columns(const Block& b, Equations& e) {
+  Floats lanes[N];
+#pragma GCC unroll 9
+  for (int k = 0; k < N; ++k) lanes[k] = Floats(0.0f);
+  for (int i = 0; i < kBlock; i += kLanes) {
+    const Floats row = Floats::load(b.rows[R] + i);
+#pragma GCC unroll 9
+    for (int k = 0; k < N; ++k) lanes[k] = lanes[k] + row * Floats::load(b.rows[C + k] + i);
+  }
+  if constexpr (R < 6) {
+    for (int i = kBlock; i < 2 * kBlock; i += kLanes) {
+      const Floats row = Floats::load(b.rows[R] + i);
+#pragma GCC unroll 9
+      for (int k = 0; k < N; ++k)
+        if (C + k < 6 || C + k == kUnknowns)
+          lanes[k] = lanes[k] + row * Floats::load(b.rows[C + k] + i);
+    }
+  }
+#pragma GCC unroll 9
+  for (int k = 0; k < N; ++k) {
+    double& total = C + k == kUnknowns ? e.gradient[R] : e.hessian[R * kUnknowns + C + k];
+    total += ldo::LDO_ISA::sum(lanes[k]);
+  }
+}
+
+template <int R, int C>
+[[gnu::always_inline]] inline void accumulate_rows(const Block& b, Equations& e) {
+  if constexpr (R < kUnknowns && C <= kUnknowns) {
+    constexpr int kLeft = kUnknowns + 1 - C, kCount = kLeft < kColumns ? kLeft : kColumns;
+    accumulate_columns<R, C, kCount>(b, e);
+    accumulate_rows<R, C + kCount>(b, e);
+  } else if constexpr (R + 1 < kUnknowns) {
+    accumulate_rows<R + 1, R + 1>(b, e);
+  }
 }
 
 void accumulate(const Block& b, Equations& e) {
-  for (int r = 0; r < kUnknowns; ++r) {
-    for (int c = r; c <= kUnknowns; ++c) {
-      // Geometric residuals do not depend on gain and bias.
-      const bool affine = r >= 6 || c == 6 || c == 7;
-      const double value = dot(b.rows[r], b.rows[c], affine ? kBlock : 2 * kBlock);
-      if (c == kUnknowns)
-        e.gradient[r] += value;
-      else
-        e.hessian[r * kUnknowns + c] += value;
-    }
-  }
+  accumulate_rows<0, 0>(b, e);
   e.visible += sum(b.visible);
   e.photometric_count += sum(b.photometric[0]);
   e.photometric_inliers += sum(b.photometric[1]);
