@@ -20,6 +20,7 @@ import small_gicp
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, se3
 from ldo_service.geometry.pnp import solve_pnp
+from ldo_service.kernels import _matching
 
 from .pyramid import Level, Pyramid, ReferencePoints
 
@@ -157,9 +158,10 @@ def _nearest_bits(
         Index of the nearest frame descriptor, its distance, and the distance of the second
         nearest one; [N] each.
     """
-    pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(reference, frame, k=2)
-    distances = np.array([(best.distance, second.distance) for best, second in pairs])
-    return np.array([best.trainIdx for best, _ in pairs]), *distances.T
+    count = len(reference)
+    index, least, second = np.empty(count, np.int64), *np.empty((2, count), np.int32)
+    _matching.nearest(reference, frame, index, least, second)
+    return index, least, second
 
 
 def _nearest_gradients(
