@@ -90,7 +90,16 @@ class FeaturePose:
 
 
 def detect(view: Pyramid, config: FeatureConfig) -> Features:
-    """Detect ORB features in the full-resolution image, and read the measured depth of each."""
+    """Detect ORB features in the full-resolution image, and read the measured depth of each.
+
+    The view keeps its features. A second call with the same settings returns them again.
+    """
+    if config not in view.features:
+        view.features[config] = _detected(view, config)
+    return view.features[config]
+
+
+def _detected(view: Pyramid, config: FeatureConfig) -> Features:
     orb = cv2.ORB.create(nfeatures=config.count, fastThreshold=config.fast_threshold)
     keypoints, descriptors = orb.detectAndCompute(view.gray, None)
     if descriptors is None:

@@ -7,7 +7,8 @@ reference points are the surface points of a keyframe, to which frames are align
 Conventions: `ldo_service.geometry`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import cv2
 import numpy as np
@@ -85,6 +86,8 @@ class Pyramid:
     depth_m: np.ndarray  # [H, W] float32 meters; 0 where unknown.
     camera: Camera  # Intrinsics of the full-resolution image.
     levels: tuple[Level, ...]  # The finest first.
+    # Features of the image that are known already, by their settings; see `features.detect`.
+    features: dict[Any, Any] = field(default_factory=dict, repr=False, compare=False)
 
 
 def intrinsics(camera: Camera) -> Intrinsics:
