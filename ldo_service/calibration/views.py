@@ -11,6 +11,7 @@ import numpy as np
 
 from ldo_service.geometry import Camera, RgbdFrame, se3
 from ldo_service.geometry.pnp import solve_pnp
+from ldo_service.kernels import _surfaces
 
 from .outlines import COLUMNS, outline_points
 
@@ -358,15 +359,11 @@ def reprojection(
         Errors [N, 2] in pixels; their derivatives [N, 2, 6] with respect to the increment x of
         the transform exp(x) T, rotation first; and the points in the camera frame, [N, 3] meters.
     """
-    moved = points @ T[:3, :3].T + T[:3, 3]
-    x, y, z = moved.T
-    inverse = 1.0 / np.where(abs(z) > 1e-6, z, 1e-6)
-    a, b = x * inverse, y * inverse
-    errors = np.stack([camera.fx * a + camera.cx, camera.fy * b + camera.cy], axis=1) - pixels
-    zero = np.zeros_like(a)
-    by_u = np.stack([-a * b, 1.0 + a * a, -b, inverse, zero, -a * inverse], axis=1)
-    by_v = np.stack([-1.0 - b * b, a * b, a, zero, inverse, -b * inverse], axis=1)
-    return errors, np.stack([camera.fx * by_u, camera.fy * by_v], axis=1), moved
+    count = len(points)
+    errors, by_transform, moved = np.empty((count, 2)), np.empty((count, 2, 6)), np.empty((count, 3))
+    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
+    _surfaces.reproject(points, pixels, T, intrinsics, errors, by_transform, moved)
+    return errors, by_transform, moved
 
 
 def _extremes(image: np.ndarray, block: int) -> tuple[np.ndarray, np.ndarray]:
