@@ -107,7 +107,8 @@ def mask_clipped(gray: np.ndarray) -> np.ndarray:
     Returns:
         Gray levels, [H, W] float32; 0 where overexposed or already 0 (black).
     """
-    return np.where(gray < CLIPPED, gray, 0).astype(np.float32)
+    _, exposed = cv2.threshold(gray, CLIPPED - 1, 0, cv2.THRESH_TOZERO_INV)
+    return exposed.astype(np.float32)
 
 
 def halved_image(image: np.ndarray, least: int = 1) -> np.ndarray:
