@@ -236,11 +236,17 @@ def build_reference(pyramid: Pyramid, ignore_mask: np.ndarray | None = None) -> 
 def _cells_of(points: np.ndarray, camera: Camera) -> np.ndarray:
     """Return the cell of the image in which each point [7, N] lies, [N] uint8."""
     columns, rows = CELLS
-    u = (camera.fx * points[0] / points[2] + camera.cx) * (columns / camera.width)
-    v = (camera.fy * points[1] / points[2] + camera.cy) * (rows / camera.height)
-    column = np.clip(u.astype(np.int32), 0, columns - 1)
-    row = np.clip(v.astype(np.int32), 0, rows - 1)
-    return (columns * row + column).astype(np.uint8)
+
+    def place(axis: int, focal: float, center: float, scale: float, count: int) -> np.ndarray:
+        pixels = focal * points[axis]
+        pixels /= points[2]
+        pixels += center
+        pixels *= scale
+        return pixels.clip(0, count - 1, out=pixels).astype(np.uint8)
+
+    column = place(0, camera.fx, camera.cx, columns / camera.width, columns)
+    row = place(1, camera.fy, camera.cy, rows / camera.height, rows)
+    return columns * row + column
 
 
 def _without(level: Level, ignore_mask: np.ndarray | None) -> Level:
