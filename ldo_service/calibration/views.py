@@ -368,7 +368,8 @@ def reprojection(
         the transform exp(x) T, rotation first; and the points in the camera frame, [N, 3] meters.
     """
     count = len(points)
-    errors, by_transform, moved = np.empty((count, 2)), np.empty((count, 2, 6)), np.empty((count, 3))
+    errors, moved = np.empty((count, 2)), np.empty((count, 3))
+    by_transform = np.empty((count, 2, 6))
     intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
     _surfaces.reproject(points, pixels, T, intrinsics, errors, by_transform, moved)
     return errors, by_transform, moved
