@@ -173,7 +173,7 @@ def test_comparison_of_features_equals_that_of_numpy() -> None:
 
 def test_reprojection_equals_that_of_numpy() -> None:
     pixels, depth_m, _ = random_features()
-    points = CAMERA.points_at(*pixels.T, depth_m)
+    points = CAMERA.points_at(pixels[:, 0], pixels[:, 1], depth_m)
     points[0, 2] = -T[2, 3]  # Near the plane of the camera center.
     found = np.empty((200, 2)), np.empty((200, 2, 6)), np.empty((200, 3))
     _surfaces.reproject(points, pixels, T, INTRINSICS, *found)
