@@ -29,7 +29,6 @@ from .views import (
     CalibrationView,
     ViewPair,
     block_centers,
-    reprojection,
 )
 
 TIME_TERMS = 3  # Readout of color, readout of depth and delay of depth.
@@ -42,9 +41,6 @@ DEPTH_WEIGHT = 0.12
 FEATURE_SIGMA_PX = 1.0
 # Depth difference, as a fraction of depth, beyond which two points are on different surfaces.
 MAX_STEP_RATIO = 0.08
-# Minimum absolute cosine between the normal of a surface and the viewing ray. At a smaller cosine,
-# depth changes too fast along the surface.
-MIN_INCIDENCE = 0.2
 BLOCK_STRIDE = 3  # Every third block along each axis is compared; neighbors are alike.
 COLOR_STRIDE = 2  # Colors are compared at every second common point; neighbors are alike.
 MIN_COMMON = 200  # Minimum number of compared colors; a pair with fewer is skipped for vignetting.
@@ -170,84 +166,23 @@ def feature_block(compared: ComparedPair, surface_first: np.ndarray) -> Block:
             see `view_surface`.
     """
     view, pair, camera = compared.first, compared.pair, compared.first.camera
-    (readout_s, depth_readout_s, delay_s), T = compared.shared[TIMES], pair.T_second_first
-    row_there, row_here = (
-        _rows(pixels, camera) for pixels in (pair.pixels_first, pair.pixels_second)
+    rows = np.empty((2 * len(pair.depth_first_m), COLUMNS))
+    _surfaces.compare_features(
+        surface_first,
+        pair.pixels_first,
+        pair.depth_first_m,
+        pair.pixels_second,
+        pair.T_second_first,
+        view.velocity,
+        compared.second.velocity,
+        compared.shared[BIAS].tolist(),
+        compared.shared[TIMES].tolist(),
+        (camera.fx, camera.fy, camera.cx, camera.cy),
+        (camera.width, camera.height),
+        view.block,
+        rows,
     )
-    u, v = pair.pixels_first.T
-    rays, basis = camera.rays_at(u, v), bias_basis(u, v, camera)
-    measured_m = unbiased_depth(pair.depth_first_m, basis @ compared.shared[BIAS])
-    # First, the depth is corrected to the time at which the color row of the first view was
-    # recorded. The point is then moved to the time of the middle row, transformed to the second
-    # view, and moved to the time of the color row in that view.
-    z_per_s = _depth_speed(view, surface_first, rays, measured_m, pair.pixels_first)
-    z = measured_m + z_per_s * (delay_s + (depth_readout_s - readout_s) * row_there)
-    points = rays * z[:, None]
-    speed_there = _speed(points, view.velocity)
-    at_middle = points + speed_there * (readout_s * row_there)[:, None]
-    at_middle = at_middle @ T[:3, :3].T + T[:3, 3]
-    speed_here = _speed(at_middle, compared.second.velocity)
-    here = at_middle - speed_here * (readout_s * row_here)[:, None]
-    errors, by_point, _ = reprojection(camera, np.eye(4), here, pair.pixels_second)
-    by_place = by_point[..., 3:]
-    # Directions in which the points move per unit of depth. The small rotations of the camera
-    # matter, because a point that moves along its own ray keeps its pixel.
-    along = _turned(rays, view.velocity, readout_s * row_there) @ T[:3, :3].T
-    along = _turned(along, compared.second.velocity, -readout_s * row_here)
-    # The depth of a point on a ray changes by -z^2 per unit of the bias.
-    by_bias = -(by_place @ along[..., None]) * (measured_m**2)[:, None, None] * basis[:, None]
-    by_depth = along * z_per_s[:, None]
-    by_row = by_depth * row_there[:, None]
-    by_readout = (speed_there @ T[:3, :3].T) * row_there[:, None] - speed_here * row_here[:, None]
-    by_times = by_place @ np.stack([by_readout - by_row, by_row, by_depth], axis=-1)
-    columns = [by_bias, by_times, by_point, errors[..., None]]
-    rows = np.concatenate(columns, axis=-1).reshape(-1, COLUMNS)
     return Block(rows, student_weight(rows[:, -1], FEATURE_SIGMA_PX), np.zeros(0, int))
-
-
-def _rows(pixels: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return the image rows of pixels [N, 2] as fractions of the height, -0.5..0.5."""
-    return pixels[:, 1] / (camera.height - 1) - 0.5
-
-
-def _speed(points: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """Return the velocity [N, 3] in m/s of points [N, 3] that move with the camera."""
-    return np.cross(velocity[:3], points) + velocity[3:]
-
-
-def _turned(vectors: np.ndarray, velocity: np.ndarray, times_s: np.ndarray) -> np.ndarray:
-    """Rotate vectors [N, 3] by the rotation of the camera during the times [N]."""
-    return vectors + np.cross(velocity[:3], vectors) * times_s[:, None]
-
-
-def _depth_speed(
-    view: CalibrationView,
-    surface: np.ndarray,
-    rays: np.ndarray,
-    depth_m: np.ndarray,
-    pixels: np.ndarray,
-) -> np.ndarray:
-    """Return the speed at which the depth of fixed pixels decreases, [N] m/s.
-
-    Depth is measured some time after color. The depth at the time of color is the measured depth
-    plus this speed times the delay. The speed is that of the tangent plane of the surface; it is 0
-    where no plane is known.
-
-    Args:
-        view: View.
-        surface: Points and normals of its blocks, [h w, 6].
-        rays: Rays of the pixels, [N, 3].
-        depth_m: Depth of the pixels, [N].
-        pixels: Pixels, [N, 2].
-    """
-    height, width = view.depth_m.shape
-    column, row = ((pixels + 0.5) // view.block).astype(int).T
-    column, row = np.clip(column, 0, width - 1), np.clip(row, 0, height - 1)
-    normals = surface[row * width + column, 3:]
-    incidence = np.sum(normals * rays, axis=1)
-    is_known = abs(incidence) > MIN_INCIDENCE
-    along = np.sum(normals * _speed(rays * depth_m[:, None], view.velocity), axis=1)
-    return np.where(is_known, along / np.where(is_known, incidence, 1.0), 0.0)
 
 
 def color_block(

@@ -235,8 +235,10 @@ def unbiased_depth(depth_m: np.ndarray, bias: np.ndarray) -> np.ndarray:
     """
     is_known = depth_m > 0
     inverse = 1.0 / np.where(is_known, depth_m, 1.0) + bias
-    corrected = 1.0 / np.maximum(inverse, MIN_INVERSE_DEPTH)
-    return np.where(is_known, corrected, 0.0).astype(depth_m.dtype)
+    np.maximum(inverse, MIN_INVERSE_DEPTH, out=inverse)
+    corrected = np.divide(1.0, inverse, out=inverse)
+    corrected *= is_known
+    return corrected.astype(depth_m.dtype, copy=False)
 
 
 def bias_basis(u: np.ndarray, v: np.ndarray, camera: Camera) -> np.ndarray:

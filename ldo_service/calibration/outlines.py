@@ -164,16 +164,23 @@ def _outlines(z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     Args:
         z: Depth, [h, w] meters; 0 where unknown.
     """
-    inverse = np.where(z > 0, 1 / np.maximum(z, 1e-3), 0).astype(np.float32)
-    window = np.ones((HOLE_PX, HOLE_PX), np.uint8)
-    farthest = cv2.erode(np.where(z > 0, inverse, np.float32(1e3)), window)
-    filled = np.where(z > 0, inverse, np.where(farthest < 1e3, farthest, 0))
+    is_known = z > 0
+    filled = np.maximum(z, np.float32(1e-3))
+    np.divide(1, filled, out=filled)
+    if not is_known.all():
+        window = np.ones((HOLE_PX, HOLE_PX), np.uint8)
+        farthest = cv2.erode(np.where(is_known, filled, np.float32(1e3)), window)
+        filled = np.where(is_known, filled, np.where(farthest < 1e3, farthest, 0))
     near, far = (f(filled, np.ones((3, 3), np.uint8)) for f in (cv2.dilate, cv2.erode))
-    is_outline = (z > 0) & (far > 0) & (near > MIN_JUMP_RATIO * far) & (filled > NEAR_SIDE * near)
-    border = REACH_PX // 2
-    is_outline[:border] = is_outline[-border:] = False
-    is_outline[:, :border] = is_outline[:, -border:] = False
-    row, column = np.nonzero(is_outline)
+    # Few pixels are beside a jump, and the other conditions are tested for these alone.
+    border, (height, width) = REACH_PX // 2, z.shape
+    row, column = np.nonzero(near > MIN_JUMP_RATIO * far)
+    is_inside = (row >= border) & (row < height - border)
+    is_inside &= (column >= border) & (column < width - border)
+    row, column = row[is_inside], column[is_inside]
+    at = row, column
+    is_outline = is_known[at] & (far[at] > 0) & (filled[at] > NEAR_SIDE * near[at])
+    row, column = row[is_outline], column[is_outline]
     stride = -(-len(row) // MAX_POINTS) if len(row) else 1
     row, column = row[::stride], column[::stride]
     smooth = cv2.GaussianBlur(filled, (0, 0), 2.0)

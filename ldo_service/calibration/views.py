@@ -11,6 +11,7 @@ import numpy as np
 
 from ldo_service.geometry import Camera, RgbdFrame, se3
 from ldo_service.geometry.pnp import solve_pnp
+from ldo_service.kernels import _surfaces
 
 from .outlines import COLUMNS, outline_points
 
@@ -331,7 +332,7 @@ def _refined(
     for _ in range(REFINEMENTS):
         errors, by_point, _ = reprojection(camera, T, points, pixels)
         size_px = np.sqrt(np.sum(errors**2, axis=1))
-        scale_px = max(float(np.median(size_px)), 0.5 * limit_px)
+        scale_px = max(_median(size_px), 0.5 * limit_px)
         weight = 1.0 / (1.0 + (size_px / scale_px) ** 2)
         J, r = by_point.reshape(-1, 6), errors.reshape(-1)
         weighted = J * np.repeat(weight, 2)[:, None]
@@ -341,6 +342,14 @@ def _refined(
     inliers = np.flatnonzero(np.sum(errors**2, axis=1) < limit_px**2)
     is_enough = len(inliers) >= max(MIN_POINTS, MIN_INLIER_RATIO * len(points))
     return (se3.orthonormalize(T), inliers) if is_enough else None
+
+
+def _median(values: np.ndarray) -> float:
+    """Return the median of values [N], N > 0; `np.median` takes longer for its checks."""
+    half = len(values) // 2
+    if len(values) % 2:
+        return float(np.partition(values, half)[half])
+    return float(np.partition(values, (half - 1, half))[half - 1 : half + 1].mean())
 
 
 def reprojection(
@@ -358,15 +367,12 @@ def reprojection(
         Errors [N, 2] in pixels; their derivatives [N, 2, 6] with respect to the increment x of
         the transform exp(x) T, rotation first; and the points in the camera frame, [N, 3] meters.
     """
-    moved = points @ T[:3, :3].T + T[:3, 3]
-    x, y, z = moved.T
-    inverse = 1.0 / np.where(abs(z) > 1e-6, z, 1e-6)
-    a, b = x * inverse, y * inverse
-    errors = np.stack([camera.fx * a + camera.cx, camera.fy * b + camera.cy], axis=1) - pixels
-    zero = np.zeros_like(a)
-    by_u = np.stack([-a * b, 1.0 + a * a, -b, inverse, zero, -a * inverse], axis=1)
-    by_v = np.stack([-1.0 - b * b, a * b, a, zero, inverse, -b * inverse], axis=1)
-    return errors, np.stack([camera.fx * by_u, camera.fy * by_v], axis=1), moved
+    count = len(points)
+    errors, moved = np.empty((count, 2)), np.empty((count, 3))
+    by_transform = np.empty((count, 2, 6))
+    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
+    _surfaces.reproject(points, pixels, T, intrinsics, errors, by_transform, moved)
+    return errors, by_transform, moved
 
 
 def _extremes(image: np.ndarray, block: int) -> tuple[np.ndarray, np.ndarray]:

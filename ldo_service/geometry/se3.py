@@ -5,22 +5,32 @@ interpolates between pairs of transforms, and fits a transform to corresponding 
 PAMI 1991).
 """
 
+from math import atan2, copysign, sin, sqrt
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 Array = np.ndarray
+IDENTITY = np.eye(4)  # It is never changed.
+IDENTITY.setflags(write=False)
+MAX_ROUNDING = 1e-12  # Largest error of R R^T of a rotation R; a larger one is removed first.
+
+
+def length(v: Array) -> float:
+    """Return the length of a vector [N]; `np.linalg.norm` takes longer for its checks."""
+    return sqrt(v.dot(v))
 
 
 def skew(v: Array) -> Array:
     """Return the matrix [3, 3] of the cross product: `skew(v) @ w == cross(v, w)`."""
-    x, y, z = v
+    x, y, z = v.tolist() if isinstance(v, np.ndarray) else v
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def exp(xi: Array) -> Array:
     """Return the transform [4, 4] of a tangent vector xi [6] (rotation rad, translation m)."""
     omega, v = np.asarray(xi[:3], float), np.asarray(xi[3:], float)
-    theta = float(np.linalg.norm(omega))
+    theta = length(omega)
     W = skew(omega)
     if theta < 1e-6:  # Second-order series with an error below 1e-18.
         a, b, c = 1.0 - theta**2 / 6, 0.5 - theta**2 / 24, 1.0 / 6 - theta**2 / 120
@@ -28,22 +38,67 @@ def exp(xi: Array) -> Array:
         a = np.sin(theta) / theta
         b = 2.0 * (np.sin(theta / 2) / theta) ** 2  # 1 - cos would lose digits near zero.
         c = (1.0 - a) / theta**2
-    T = np.eye(4)
+    T = IDENTITY.copy()
     T[:3, :3] += a * W + b * W @ W
-    T[:3, 3] = (np.eye(3) + b * W + c * W @ W) @ v
+    T[:3, 3] = (IDENTITY[:3, :3] + b * W + c * W @ W) @ v
     return T
 
 
 def log(T: Array) -> Array:
     """Return the tangent vector [6] of T [4, 4]; the inverse of `exp` for rotations below pi."""
-    omega = Rotation.from_matrix(T[:3, :3]).as_rotvec()
-    theta = float(np.linalg.norm(omega))
+    omega = rotation_vector(T[:3, :3])
+    theta = length(omega)
     W = skew(omega)
     if theta < 1e-4:  # The closed form loses digits here; the series is exact to 1e-17.
         d = 1.0 / 12 + theta**2 / 720
     else:
         d = (1.0 - theta * np.cos(theta / 2) / (2 * np.sin(theta / 2))) / theta**2
-    return np.r_[omega, (np.eye(3) - 0.5 * W + d * W @ W) @ T[:3, 3]]
+    return np.r_[omega, (IDENTITY[:3, :3] - 0.5 * W + d * W @ W) @ T[:3, 3]]
+
+
+def rotation_vector(R: Array) -> Array:
+    """Return the rotation vector [3] in rad of a rotation [3, 3].
+
+    The formulas are those of `scipy.spatial.transform.Rotation`, whose checks of one matrix take
+    ten times as long as the conversion.
+
+    Raises:
+        ValueError: The matrix is not a rotation: its determinant is not positive.
+    """
+    x, y, z, w = _unit_quaternion(R)
+    sine = sqrt(x * x + y * y + z * z)
+    angle = 2.0 * atan2(sine, w)
+    if angle <= 1e-3:  # A series, since the sine may be 0.
+        scale = 2.0 + angle**2 / 12 + 7.0 * angle**4 / 2880
+    else:
+        scale = angle / sin(angle / 2)
+    return np.array([scale * x, scale * y, scale * z])
+
+
+def _unit_quaternion(R: Array) -> tuple[float, float, float, float]:
+    """Return the unit quaternion xyzw, w >= 0, of a rotation [3, 3].
+
+    Raises:
+        ValueError: The determinant is not positive.
+    """
+    m = R.tolist()
+    (a, b, c), (d, e, f), (g, h, i) = m
+    trace, largest = a + e + i, max(a, e, i)
+    if trace >= largest:
+        x, y, z, w = h - f, c - g, d - b, 1.0 + trace
+    else:
+        n = [a, e, i].index(largest)
+        j, k = (n + 1) % 3, (n + 2) % 3
+        q = [0.0, 0.0, 0.0]
+        q[n], q[j], q[k] = 1.0 - trace + 2.0 * largest, m[j][n] + m[n][j], m[k][n] + m[n][k]
+        (x, y, z), w = q, m[k][j] - m[j][k]
+    is_right_handed = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0.5
+    is_exact = is_right_handed and abs(R @ R.T - IDENTITY[:3, :3]).max() < MAX_ROUNDING
+    if not is_exact or w == 0.0:  # Two quaternions with w = 0 are of one rotation.
+        x, y, z, w = Rotation.from_matrix(R).as_quat(canonical=True).tolist()
+        return x, y, z, w
+    norm = copysign(sqrt(x * x + y * y + z * z + w * w), w)
+    return x / norm, y / norm, z / norm, w / norm
 
 
 def inverse(T: Array) -> Array:
@@ -62,8 +117,9 @@ def orthonormalize(T: Array) -> Array:
     This removes the rounding errors that products of transforms accumulate.
     """
     U, _, Vt = np.linalg.svd(T[:3, :3])
-    out = np.eye(4)
-    out[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    U[:, 2] *= np.linalg.det(U @ Vt)
+    out = IDENTITY.copy()
+    out[:3, :3] = U @ Vt
     out[:3, 3] = T[:3, 3]
     return out
 
@@ -107,6 +163,9 @@ def quaternion(R: Array) -> Array:
     Raises:
         ValueError: A matrix is not a rotation: its determinant is not positive.
     """
+    if R.shape == (3, 3):
+        x, y, z, w = _unit_quaternion(R)
+        return np.array([w, x, y, z])
     if not R.size:  # Some supported versions of SciPy reject an empty batch.
         return np.zeros((*R.shape[:-2], 4))
     xyzw = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat(canonical=True)

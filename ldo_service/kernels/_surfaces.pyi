@@ -1,5 +1,7 @@
 """Binding of the comparison of calibration views, `kernels/surfaces.hpp`."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -74,4 +76,69 @@ def compare(
 
     Raises:
         ValueError: An array has the wrong shape, type or strides, or a number is out of range.
+    """
+
+def compare_features(
+    there: Values,
+    pixels_there: Values,
+    depth_there: Values,
+    pixels_here: Values,
+    T_here_there: Values,
+    velocity_there: Values,
+    velocity_here: Values,
+    bias: Sequence[float],
+    times_s: Sequence[float],
+    intrinsics: tuple[float, float, float, float],
+    size: tuple[int, int],
+    block: int,
+    rows: Values,
+) -> None:
+    """Compare features of two views by their reprojection errors, in pixels.
+
+    The point of a feature is moved between the times at which its rows were recorded, as in
+    `compare`.
+
+    Args:
+        there: Result of `surfaces` for the first view, [h w, 6].
+        pixels_there: Pixels of the features in the first view, [M, 2].
+        depth_there: Their depth in the first view, [M] meters, above 0.
+        pixels_here: Their pixels in the second view, [M, 2].
+        T_here_there: Transform from the first camera to the second one, [4, 4].
+        velocity_there: Velocity of the first camera, see `compare`, [6].
+        velocity_here: Velocity of the second camera, [6].
+        bias: Coefficients of the depth bias, [3] 1/m; it is removed from the depth.
+        times_s: Readout of color, readout of depth and delay of depth, [3] seconds.
+        intrinsics: fx, fy, cx, cy of the full image.
+        size: Width and height of the full image, pixels.
+        block: Side of a block, pixels.
+        rows: Output, [2 M, 13]. Each feature has two rows: the error in u, and the error in v. The
+            columns are those of `compare`.
+
+    Raises:
+        ValueError: An array has the wrong shape, type or strides, or a number is out of range.
+    """
+
+def reproject(
+    points: Values,
+    pixels: Values,
+    T: Values,
+    intrinsics: tuple[float, float, float, float],
+    errors: Values,
+    derivatives: Values,
+    moved: Values,
+) -> None:
+    """Compute reprojection errors and their derivatives.
+
+    Args:
+        points: Points, [N, 3] meters.
+        pixels: Measured pixels of the points, [N, 2].
+        T: Transform of the points into the camera, [4, 4].
+        intrinsics: fx, fy, cx, cy of the camera.
+        errors: Output, [N, 2] pixels.
+        derivatives: Output, [N, 2, 6]: derivatives of the errors with respect to x in exp(x) T,
+            rotation first.
+        moved: Output, [N, 3]: points in the camera, meters.
+
+    Raises:
+        ValueError: An array has the wrong shape, type or strides.
     """

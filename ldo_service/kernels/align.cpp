@@ -6,11 +6,14 @@
 #include <cmath>
 #include <cstring>
 
+#include "transpose.hpp"
+
 namespace ldo::align {
 namespace {
 
-constexpr int kBlock = 256;
-constexpr int kLanes = 16;
+using namespace ldo::LDO_ISA;
+
+constexpr int kBlock = 256, kChunk = 64;
 // Degrees of freedom of the t-distribution (Kerl et al. 2013, III.B).
 constexpr float kDegrees = 5.0f;
 constexpr float kInlierSigma = 3.0f;
@@ -119,35 +122,46 @@ std::int64_t points(const float* texels, const float* normals, int width, int he
   return n;
 }
 
-// Intermediate values of one block of points; rows of kBlock floats.
+// Values of one block of points. Its points are processed in chunks, whose intermediate values fit
+// into the fastest cache beside the values of the block.
 struct alignas(64) Block {
-  float point[kPointRows][kBlock];        // Reference frame, as stored.
-  float x[kBlock], y[kBlock], z[kBlock];  // Target camera frame.
-  float du[kBlock], dv[kBlock];           // Fractions of the bilinear sample.
-  int corner[kBlock], nearest[kBlock];    // Texel indices.
-  float column[kBlock], row[kBlock];      // Nearest pixel.
-  float visible[kBlock];
-  float intensity[kBlock], gradient_u[kBlock], gradient_v[kBlock], depth[kBlock];
   // sqrt(w) [J | r] of the photometric residuals, then of the geometric residuals.
   float rows[kUnknowns + 1][2 * kBlock];
+  float visible[kBlock];
   // Three values of each residual: 1 if it is used, 1 if it is an inlier, and w (r/sigma)^2.
   float photometric[3][kBlock], geometric[3][kBlock];
+  // Intermediate values of a chunk.
+  float x[kChunk], y[kChunk], z[kChunk];  // Target camera frame.
+  float inverse_z[kChunk];
+  float du[kChunk], dv[kChunk];         // Fractions of the bilinear sample.
+  int corner[kChunk], nearest[kChunk];  // Texel indices.
+  float column[kChunk], row[kChunk];    // Nearest pixel.
+  float intensity[kChunk], gradient_u[kChunk], gradient_v[kChunk], depth[kChunk];
+  const float* point[kPointRows];  // Reference frame, as stored.
+  float last[kPointRows][kBlock];  // Points of the last block, filled up with zeros.
 };
 
 void load(const Problem& p, std::int64_t first, Block& b) {
   const std::int64_t left = p.count - first;
-  const int n = left < kBlock ? static_cast<int>(left) : kBlock;
   for (int k = 0; k < kPointRows; ++k) {
-    std::memcpy(b.point[k], p.points + k * p.count + first, sizeof(float) * n);
-    if (n < kBlock) std::memset(b.point[k] + n, 0, sizeof(float) * (kBlock - n));
+    const float* values = p.points + k * p.count + first;
+    b.point[k] = values;
+    if (left >= kBlock) continue;
+    const int n = static_cast<int>(left);
+    std::memcpy(b.last[k], values, sizeof(float) * n);
+    std::memset(b.last[k] + n, 0, sizeof(float) * (kBlock - n));
+    b.point[k] = b.last[k];
   }
 }
 
-void project(const Problem& p, Block& b) {
+void project(const Problem& p, int first, Block& b) {
   const float* T = p.T_camera_reference;
   const float right = p.width - 2.0f, bottom = p.height - 2.0f;
-  for (int i = 0; i < kBlock; ++i) {
-    const float X = b.point[kX][i], Y = b.point[kY][i], Z = b.point[kZ][i];
+  const float *points_x = b.point[kX] + first, *points_y = b.point[kY] + first,
+              *points_z = b.point[kZ] + first;
+#pragma GCC ivdep
+  for (int i = 0; i < kChunk; ++i) {
+    const float X = points_x[i], Y = points_y[i], Z = points_z[i];
     const float x = T[0] * X + T[1] * Y + T[2] * Z + T[3];
     const float y = T[4] * X + T[5] * Y + T[6] * Z + T[7];
     const float z = T[8] * X + T[9] * Y + T[10] * Z + T[11];
@@ -160,31 +174,99 @@ void project(const Problem& p, Block& b) {
     const int iu = static_cast<int>(su), iv = static_cast<int>(sv);
     const int nu = static_cast<int>(su + 0.5f), nv = static_cast<int>(sv + 0.5f);
     b.x[i] = x, b.y[i] = y, b.z[i] = in_front ? z : 1.0f;
+    b.inverse_z[i] = inverse;
     b.du[i] = su - iu, b.dv[i] = sv - iv;
     b.corner[i] = iv * p.width + iu, b.nearest[i] = nv * p.width + nu;
     b.column[i] = static_cast<float>(nu), b.row[i] = static_cast<float>(nv);
-    b.visible[i] = inside ? 1.0f : 0.0f;
+    b.visible[first + i] = inside ? 1.0f : 0.0f;
   }
 }
 
+// A register holds whole texels, of kPoints points.
+constexpr int kPoints = kPerRegister / kTexelSize;
+static_assert(kTexelSize == 4);
+
+// Load the texels at `place`, `place + kTexelSize` and so on, floats.
+FloatRegister load_texels(const float* texels, const std::int64_t* places) {
+#if defined(__AVX512F__)
+  const auto at = [&](int i) { return _mm_loadu_ps(texels + places[kTexelSize * i]); };
+  const __m512 two = _mm512_insertf32x4(_mm512_castps128_ps512(at(0)), at(1), 1);
+  return _mm512_insertf32x4(_mm512_insertf32x4(two, at(2), 2), at(3), 3);
+#elif defined(__AVX2__)
+  const auto at = [&](int i) { return _mm_loadu_ps(texels + places[kTexelSize * i]); };
+  return _mm256_insertf128_ps(_mm256_castps128_ps256(at(0)), at(1), 1);
+#else
+  FloatRegister values;
+  std::memcpy(&values, texels + places[0], sizeof values);
+  return values;
+#endif
+}
+
+// Pattern that repeats the value K of each group of four lanes in the whole group.
+template <int K>
+struct Repeat {
+  static constexpr int source(int lane) { return (lane & ~3) + K; }
+};
+
+// Pattern that replaces the last value of each group of four lanes by the first one of another
+// register.
+struct ReplaceLast {
+  static constexpr int source(int lane) {
+    return (lane & 3) == 3 ? (lane & ~3) + kPerRegister : lane;
+  }
+};
+
+// Interpolate the texels between the four pixels around a point, for kPoints points. The results
+// have intensity and gradients. In place of the depth, they have the lowest intensity of the four
+// pixels.
+[[gnu::always_inline]] inline FloatRegister interpolated(const float* texels,
+                                                         const std::int64_t* places,
+                                                         std::int64_t below, FloatRegister du,
+                                                         FloatRegister dv) {
+  const FloatRegister a = load_texels(texels, places);
+  const FloatRegister b = load_texels(texels + kTexelSize, places);
+  const FloatRegister c = load_texels(texels + below, places);
+  const FloatRegister d = load_texels(texels + below + kTexelSize, places);
+  const FloatRegister upper = a + du * (b - a), lower = c + du * (d - c);
+  const FloatRegister mixed = upper + dv * (lower - upper);
+  return shuffle<ReplaceLast>(mixed, least(least(a, b), least(c, d)));
+}
+
+FloatRegister load_register(const float* p) {
+  FloatRegister values;
+  std::memcpy(&values, p, sizeof values);
+  return values;
+}
+
+void store(FloatRegister values, float* p) { std::memcpy(p, &values, sizeof values); }
+
+// The points of a register lie four places apart, so that a transpose of each group of four lanes
+// brings the values of all points into order.
 void sample(const Problem& p, Block& b) {
   const std::int64_t below = static_cast<std::int64_t>(kTexelSize) * p.width;
-  for (int i = 0; i < kBlock; ++i) {
-    const float* a = p.target + static_cast<std::int64_t>(kTexelSize) * b.corner[i];
-    const float* c = a + below;
-    const float du = b.du[i], dv = b.dv[i];
-    float mixed[kTexelSize];
-    for (int k = 0; k < kTexelSize; ++k) {
-      const float upper = a[k] + du * (a[k + kTexelSize] - a[k]);
-      const float lower = c[k] + du * (c[k + kTexelSize] - c[k]);
-      mixed[k] = upper + dv * (lower - upper);
-    }
-    const float darkest = smaller(smaller(a[kIntensity], a[kTexelSize + kIntensity]),
-                                  smaller(c[kIntensity], c[kTexelSize + kIntensity]));
-    b.intensity[i] = darkest > 0 ? mixed[kIntensity] : 0.0f;
-    b.gradient_u[i] = mixed[kGradientU];
-    b.gradient_v[i] = mixed[kGradientV];
-    b.depth[i] = p.target[static_cast<std::int64_t>(kTexelSize) * b.nearest[i] + kDepth];
+  for (int i = 0; i < kChunk; i += kPerRegister) {
+    std::int64_t places[kPerRegister];
+    for (int k = 0; k < kPerRegister; ++k)
+      places[k] = static_cast<std::int64_t>(kTexelSize) * b.corner[i + k];
+    const FloatRegister du = load_register(b.du + i), dv = load_register(b.dv + i);
+    const auto at = [&](auto repeat, int k) {
+      using Pattern = decltype(repeat);
+      return interpolated(p.target, places + k, below, shuffle<Pattern>(du, du),
+                          shuffle<Pattern>(dv, dv));
+    };
+    const FloatRegister t[4] = {at(Repeat<0>(), 0), at(Repeat<1>(), 1), at(Repeat<2>(), 2),
+                                at(Repeat<3>(), 3)};
+    const FloatRegister front = shuffle<Interleave<1, false>>(t[0], t[1]);
+    const FloatRegister back = shuffle<Interleave<1, false>>(t[2], t[3]);
+    const FloatRegister front_rest = shuffle<Interleave<1, true>>(t[0], t[1]);
+    const FloatRegister back_rest = shuffle<Interleave<1, true>>(t[2], t[3]);
+    const FloatRegister intensity = shuffle<Interleave<2, false>>(front, back);
+    const FloatRegister darkest = shuffle<Interleave<2, true>>(front_rest, back_rest);
+    store(darkest > 0 ? intensity : FloatRegister{}, b.intensity + i);
+    store(shuffle<Interleave<2, true>>(front, back), b.gradient_u + i);
+    store(shuffle<Interleave<2, false>>(front_rest, back_rest), b.gradient_v + i);
+    for (int k = 0; k < kPerRegister; ++k)
+      b.depth[i + k] = p.target[static_cast<std::int64_t>(kTexelSize) * b.nearest[i + k] + kDepth];
   }
 }
 
@@ -192,44 +274,49 @@ float robust_weight(float square) { return (kDegrees + 1.0f) / (kDegrees + squar
 
 // Compute the photometric residuals r = I(project(p)) - gain * shade - bias and their Jacobians. A
 // perturbation T_reference_camera exp(xi) moves a point by dp = skew(p) omega - v.
-void weigh_photometric(const Problem& p, Block& b) {
+void weigh_photometric(const Problem& p, int first, Block& b) {
   const float inverse_sigma = 1.0f / p.intensity_sigma;
-  for (int i = 0; i < kBlock; ++i) {
-    const float x = b.x[i], y = b.y[i], z = b.z[i], inverse = 1.0f / z, seen = b.depth[i];
+  const float* shades = b.point[kShade] + first;
+#pragma GCC ivdep
+  for (int i = 0; i < kChunk; ++i) {
+    const float x = b.x[i], y = b.y[i], z = b.z[i], inverse = b.inverse_z[i], seen = b.depth[i];
     const bool hidden = (seen > 0) & (z > seen * (1.0f + p.occlusion));
-    const float used = hidden ? 0.0f : b.visible[i];
-    b.visible[i] = used;
+    const float used = hidden ? 0.0f : b.visible[first + i];
+    b.visible[first + i] = used;
     const float gx = b.gradient_u[i] * p.camera.fx * inverse;
     const float gy = b.gradient_v[i] * p.camera.fy * inverse;
     const float gz = -(gx * x + gy * y) * inverse;
-    const float shade = b.point[kShade][i];
+    const float shade = shades[i];
     const float compared = (shade > 0) & (b.intensity[i] > 0) ? used : 0.0f;
     const float r = b.intensity[i] - p.gain * shade - p.bias;
     const float normalized = r * inverse_sigma, square = normalized * normalized;
     const float weight = robust_weight(square);
     const float s = compared * std::sqrt(weight) * inverse_sigma;
-    b.rows[0][i] = s * (gy * z - gz * y);
-    b.rows[1][i] = s * (gz * x - gx * z);
-    b.rows[2][i] = s * (gx * y - gy * x);
-    b.rows[3][i] = -s * gx;
-    b.rows[4][i] = -s * gy;
-    b.rows[5][i] = -s * gz;
-    b.rows[6][i] = -s * shade;
-    b.rows[7][i] = -s;
-    b.rows[8][i] = s * r;
-    b.photometric[0][i] = compared;
-    b.photometric[1][i] = square < kInlierSigma * kInlierSigma ? compared : 0.0f;
-    b.photometric[2][i] = compared * weight * square;
+    b.rows[0][first + i] = s * (gy * z - gz * y);
+    b.rows[1][first + i] = s * (gz * x - gx * z);
+    b.rows[2][first + i] = s * (gx * y - gy * x);
+    b.rows[3][first + i] = -s * gx;
+    b.rows[4][first + i] = -s * gy;
+    b.rows[5][first + i] = -s * gz;
+    b.rows[6][first + i] = -s * shade;
+    b.rows[7][first + i] = -s;
+    b.rows[8][first + i] = s * r;
+    b.photometric[0][first + i] = compared;
+    b.photometric[1][first + i] = square < kInlierSigma * kInlierSigma ? compared : 0.0f;
+    b.photometric[2][first + i] = compared * weight * square;
   }
 }
 
 // Compute the geometric residuals r = n . (p - q) and their Jacobians, with n = R n_reference. The
 // point q is the measured surface of the target image at the nearest pixel.
-void weigh_geometric(const Problem& p, Block& b) {
+void weigh_geometric(const Problem& p, int first, Block& b) {
   const float* T = p.T_camera_reference;
   const float ifx = 1.0f / p.camera.fx, ify = 1.0f / p.camera.fy;
-  for (int i = 0; i < kBlock; ++i) {
-    const float mx = b.point[kNormalX][i], my = b.point[kNormalY][i], mz = b.point[kNormalZ][i];
+  const float *normals_x = b.point[kNormalX] + first, *normals_y = b.point[kNormalY] + first,
+              *normals_z = b.point[kNormalZ] + first;
+#pragma GCC ivdep
+  for (int i = 0; i < kChunk; ++i) {
+    const float mx = normals_x[i], my = normals_y[i], mz = normals_z[i];
     const float nx = T[0] * mx + T[1] * my + T[2] * mz;
     const float ny = T[4] * mx + T[5] * my + T[6] * mz;
     const float nz = T[8] * mx + T[9] * my + T[10] * mz;
@@ -239,14 +326,14 @@ void weigh_geometric(const Problem& p, Block& b) {
     const float r = nx * (b.x[i] - qx) + ny * (b.y[i] - qy) + nz * (b.z[i] - z);
     const bool has_normal = nx * nx + ny * ny + nz * nz > 0.5f;
     const bool paired = (z > 0) & has_normal & (std::fabs(b.z[i] - z) < p.gate * b.z[i]);
-    const float used = paired ? b.visible[i] : 0.0f;
+    const float used = paired ? b.visible[first + i] : 0.0f;
     const float beyond = b.z[i] - p.noise.nearest;
     const float sigma = p.depth_noise_scale * (p.noise.floor + p.noise.growth * beyond * beyond);
     const float inverse_sigma = 1.0f / sigma;
     const float normalized = r * inverse_sigma, square = normalized * normalized;
     const float weight = robust_weight(square);
     const float s = used * std::sqrt(weight) * inverse_sigma;
-    const int j = kBlock + i;
+    const int j = kBlock + first + i;
     b.rows[0][j] = s * (ny * z - nz * qy);
     b.rows[1][j] = s * (nz * qx - nx * z);
     b.rows[2][j] = s * (nx * qy - ny * qx);
@@ -254,45 +341,70 @@ void weigh_geometric(const Problem& p, Block& b) {
     b.rows[4][j] = -s * ny;
     b.rows[5][j] = -s * nz;
     b.rows[8][j] = s * r;
-    b.geometric[0][i] = used;
-    b.geometric[1][i] = square < kInlierSigma * kInlierSigma ? used : 0.0f;
-    b.geometric[2][i] = used * weight * square;
+    b.geometric[0][first + i] = used;
+    b.geometric[1][first + i] = square < kInlierSigma * kInlierSigma ? used : 0.0f;
+    b.geometric[2][first + i] = used * weight * square;
   }
 }
 
-// Add the lanes pairwise in a fixed order, independent of the machine's vector width.
-float folded(float* lanes) {
-  for (int half = kLanes / 2; half > 0; half /= 2)
-    for (int l = 0; l < half; ++l) lanes[l] += lanes[l + half];
-  return lanes[0];
-}
-
+// Return the sum of n products a b. Sixteen partial sums are added pairwise, in an order that does
+// not depend on the machine's vector width.
 double dot(const float* a, const float* b, int n) {
-  float lanes[kLanes] = {};
-  for (int i = 0; i < n; i += kLanes)
-    for (int l = 0; l < kLanes; ++l) lanes[l] += a[i + l] * b[i + l];
-  return folded(lanes);
+  Floats lanes(0.0f);
+  for (int i = 0; i < n; i += kLanes) lanes = lanes + Floats::load(a + i) * Floats::load(b + i);
+  return sum(lanes);
 }
 
 double sum(const float* a) {
-  float lanes[kLanes] = {};
-  for (int i = 0; i < kBlock; i += kLanes)
-    for (int l = 0; l < kLanes; ++l) lanes[l] += a[i + l];
-  return folded(lanes);
+  Floats lanes(0.0f);
+  for (int i = 0; i < kBlock; i += kLanes) lanes = lanes + Floats::load(a + i);
+  return sum(lanes);
+}
+
+// Number of products with one row that are summed at once: as many as the registers hold.
+constexpr int kColumns = kRegisters == 1 ? 9 : 5;
+
+// Add the products of the row R with the columns C to C + N - 1 to the equations. A load of the row
+// then serves N products. Geometric residuals do not depend on gain and bias.
+template <int R, int C, int N>
+[[gnu::always_inline]] inline void accumulate_columns(const Block& b, Equations& e) {
+  Floats lanes[N];
+#pragma GCC unroll 9
+  for (int k = 0; k < N; ++k) lanes[k] = Floats(0.0f);
+  for (int i = 0; i < kBlock; i += kLanes) {
+    const Floats row = Floats::load(b.rows[R] + i);
+#pragma GCC unroll 9
+    for (int k = 0; k < N; ++k) lanes[k] = lanes[k] + row * Floats::load(b.rows[C + k] + i);
+  }
+  if constexpr (R < 6) {
+    for (int i = kBlock; i < 2 * kBlock; i += kLanes) {
+      const Floats row = Floats::load(b.rows[R] + i);
+#pragma GCC unroll 9
+      for (int k = 0; k < N; ++k)
+        if (C + k < 6 || C + k == kUnknowns)
+          lanes[k] = lanes[k] + row * Floats::load(b.rows[C + k] + i);
+    }
+  }
+#pragma GCC unroll 9
+  for (int k = 0; k < N; ++k) {
+    double& total = C + k == kUnknowns ? e.gradient[R] : e.hessian[R * kUnknowns + C + k];
+    total += sum(lanes[k]);
+  }
+}
+
+template <int R, int C>
+[[gnu::always_inline]] inline void accumulate_rows(const Block& b, Equations& e) {
+  if constexpr (R < kUnknowns && C <= kUnknowns) {
+    constexpr int kLeft = kUnknowns + 1 - C, kCount = kLeft < kColumns ? kLeft : kColumns;
+    accumulate_columns<R, C, kCount>(b, e);
+    accumulate_rows<R, C + kCount>(b, e);
+  } else if constexpr (R + 1 < kUnknowns) {
+    accumulate_rows<R + 1, R + 1>(b, e);
+  }
 }
 
 void accumulate(const Block& b, Equations& e) {
-  for (int r = 0; r < kUnknowns; ++r) {
-    for (int c = r; c <= kUnknowns; ++c) {
-      // Geometric residuals do not depend on gain and bias.
-      const bool affine = r >= 6 || c == 6 || c == 7;
-      const double value = dot(b.rows[r], b.rows[c], affine ? kBlock : 2 * kBlock);
-      if (c == kUnknowns)
-        e.gradient[r] += value;
-      else
-        e.hessian[r * kUnknowns + c] += value;
-    }
-  }
+  accumulate_rows<0, 0>(b, e);
   e.visible += sum(b.visible);
   e.photometric_count += sum(b.photometric[0]);
   e.photometric_inliers += sum(b.photometric[1]);
@@ -322,10 +434,12 @@ Equations normal_equations(const Problem& problem, const std::uint8_t* cells, do
   Block block;
   for (std::int64_t first = 0; first < problem.count; first += kBlock) {
     load(problem, first, block);
-    project(problem, block);
-    sample(problem, block);
-    weigh_photometric(problem, block);
-    weigh_geometric(problem, block);
+    for (int chunk = 0; chunk < kBlock; chunk += kChunk) {
+      project(problem, chunk, block);
+      sample(problem, block);
+      weigh_photometric(problem, chunk, block);
+      weigh_geometric(problem, chunk, block);
+    }
     accumulate(block, e);
     if (cells) add_to_cells(problem, block, first, cells, sums);
   }

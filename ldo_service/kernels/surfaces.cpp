@@ -102,7 +102,125 @@ bool compare_block(const SurfaceView& view, const Comparison& input, int64_t a, 
   return true;
 }
 
+constexpr double kMinIncidence = 0.2;      // Minimum |cosine| of a normal and a viewing ray.
+constexpr double kMinInverseDepth = 0.02;  // 1/m, as in `correction.unbiased_depth`.
+constexpr double kNearestDepth = 1e-6;     // Meters; nearer points are not projected.
+
+// Errors [2] of a projected point, and their derivatives [2, 6] for exp(x) T, rotation first.
+void project_point(double fx, double fy, double cx, double cy, const double* p, const double* pixel,
+                   double* errors, double* derivatives) {
+  const double inverse = 1 / (std::abs(p[2]) > kNearestDepth ? p[2] : kNearestDepth);
+  const double a = p[0] * inverse, b = p[1] * inverse;
+  errors[0] = fx * a + cx - pixel[0];
+  errors[1] = fy * b + cy - pixel[1];
+  const double by_u[6] = {-a * b, 1 + a * a, -b, inverse, 0, -a * inverse};
+  const double by_v[6] = {-1 - b * b, a * b, a, 0, inverse, -b * inverse};
+  for (int k = 0; k < 6; ++k) derivatives[k] = fx * by_u[k], derivatives[6 + k] = fy * by_v[k];
+}
+
+void transform(const double* T, const double* p, double* result) {
+  for (int k = 0; k < 3; ++k) result[k] = dot(T + 4 * k, p) + T[4 * k + 3];
+}
+
+void turn(const double* T, const double* v, double* result) {
+  for (int k = 0; k < 3; ++k) result[k] = dot(T + 4 * k, v);
+}
+
+// Rotate a vector by the rotation of the camera during a time, to first order.
+void turn_during(const double* velocity, double time_s, const double* v, double* result) {
+  double change[3];
+  cross(velocity, v, change);
+  for (int k = 0; k < 3; ++k) result[k] = v[k] + change[k] * time_s;
+}
+
+// Speed at which the depth of a fixed pixel decreases: that of the tangent plane of the surface, or
+// 0 where no plane is known.
+double depth_speed(const FeatureView& view, const Comparison& input, const double* pixel,
+                   const double* ray, double depth_m) {
+  const auto block_at = [&](double place, int64_t count) {
+    const double index = std::floor((place + 0.5) / static_cast<double>(view.block));
+    return static_cast<int64_t>(std::max(0.0, std::min(index, static_cast<double>(count - 1))));
+  };
+  const int64_t block =
+      block_at(pixel[1], view.rows) * view.columns + block_at(pixel[0], view.columns);
+  const double* n = input.there + kSurfaceDoubles * block + 3;
+  const double incidence = dot(n, ray);
+  if (!(std::abs(incidence) > kMinIncidence)) return 0;
+  const double point[3] = {ray[0] * depth_m, ray[1] * depth_m, ray[2] * depth_m};
+  double speed[3];
+  speed_of(input.motion_there, point, speed);
+  return dot(n, speed) / incidence;
+}
+
+// Write the two rows of a feature: the errors along u and v, with their derivatives.
+void compare_feature(const FeatureView& view, const Comparison& input, const double* there,
+                     double depth_there, const double* here, double* rows) {
+  const double* T = input.T_here_there;
+  const double row_there = there[1] / (view.height - 1) - 0.5;
+  const double row_here = here[1] / (view.height - 1) - 0.5;
+  const double ray[3] = {(there[0] - view.cx) / view.fx, (there[1] - view.cy) / view.fy, 1};
+  const double x = (there[0] - (view.width - 1) / 2) / (view.width / 2);
+  const double y = (there[1] - (view.height - 1) / 2) / (view.width / 2);
+  const double basis[3] = {x * x, x * y, y * y};
+  const double inverse = 1 / depth_there + dot(basis, view.bias);
+  const double measured_m = 1 / std::max(inverse, kMinInverseDepth);
+  // First, the depth is corrected to the time at which the color row of the first view was
+  // recorded. The point is then moved to the time of the middle row, transformed to the second
+  // view, and moved to the time of the color row in that view.
+  const double z_per_s = depth_speed(view, input, there, ray, measured_m);
+  const double after_color_s = view.delay_s + (view.depth_readout_s - view.readout_s) * row_there;
+  const double z = measured_m + z_per_s * after_color_s;
+  const double time_there = view.readout_s * row_there, time_here = view.readout_s * row_here;
+  double point[3], speed_there[3], speed_here[3], at_middle[3], errors[2], by_point[12];
+  for (int k = 0; k < 3; ++k) point[k] = ray[k] * z;
+  speed_of(input.motion_there, point, speed_there);
+  for (int k = 0; k < 3; ++k) point[k] += speed_there[k] * time_there;
+  transform(T, point, at_middle);
+  speed_of(input.motion_here, at_middle, speed_here);
+  for (int k = 0; k < 3; ++k) at_middle[k] -= speed_here[k] * time_here;
+  project_point(view.fx, view.fy, view.cx, view.cy, at_middle, here, errors, by_point);
+  // Direction in which the point moves per unit of depth. The small rotations of the camera matter,
+  // because a point that moves along its own ray keeps its pixel.
+  double turned[3], across[3], along[3], turned_speed[3], by_times[3][3];
+  turn_during(input.motion_there.velocity, time_there, ray, turned);
+  turn(T, turned, across);
+  turn_during(input.motion_here.velocity, -time_here, across, along);
+  turn(T, speed_there, turned_speed);
+  for (int k = 0; k < 3; ++k) {
+    const double by_depth = along[k] * z_per_s, by_row = by_depth * row_there;
+    by_times[0][k] = turned_speed[k] * row_there - speed_here[k] * row_here - by_row;
+    by_times[1][k] = by_row;
+    by_times[2][k] = by_depth;
+  }
+  for (int axis = 0; axis < 2; ++axis) {
+    double* row = rows + kRowDoubles * axis;
+    const double *derivatives = by_point + 6 * axis, *by_place = derivatives + 3;
+    // The depth of a point on a ray changes by -z^2 per unit of the bias.
+    const double by_bias = -dot(by_place, along) * (measured_m * measured_m);
+    for (int k = 0; k < 3; ++k)
+      row[k] = by_bias * basis[k], row[3 + k] = dot(by_place, by_times[k]);
+    for (int k = 0; k < 6; ++k) row[6 + k] = derivatives[k];
+    row[12] = errors[axis];
+  }
+}
+
 }  // namespace
+
+void compare_features(const FeatureView& view, const Comparison& input, const Features& features,
+                      double* rows) {
+  for (int64_t i = 0; i < features.count; ++i)
+    compare_feature(view, input, features.pixels_there + 2 * i, features.depth_there[i],
+                    features.pixels_here + 2 * i, rows + 2 * kRowDoubles * i);
+}
+
+void reproject(const Reprojection& input, double* errors, double* derivatives, double* moved) {
+  for (int64_t i = 0; i < input.count; ++i) {
+    double* p = moved + 3 * i;
+    transform(input.T, input.points + 3 * i, p);
+    project_point(input.fx, input.fy, input.cx, input.cy, p, input.pixels + 2 * i, errors + 2 * i,
+                  derivatives + 12 * i);
+  }
+}
 
 void surfaces(const double* depth_m, const double* rays, int64_t height, int64_t width,
               double step_ratio, double step_m, double* result) {

@@ -23,7 +23,8 @@ struct ViewMotion {
   double delay_s;          // Time from color to depth, middle rows.
 };
 
-// Comparison of each stride-th block along both axes.
+// Comparison of each stride-th block along both axes. Features are compared without `here`,
+// `basis`, `stride` and `max_step_ratio`.
 struct Comparison {
   const double* there;         // [height width, 6]
   const double* here;          // [height width, 6]
@@ -40,11 +41,40 @@ struct Compared {
   int64_t* indices;  // [N, 2] blocks there and here.
 };
 
-#define LDO_DECLARE(isa)                                                                  \
-  namespace isa {                                                                         \
-  void surfaces(const double* depth_m, const double* rays, int64_t height, int64_t width, \
-                double step_ratio, double step_m, double* result);                        \
-  int64_t compare(const SurfaceView& view, const Comparison& input, Compared& result);    \
+// Camera and unknowns at which features are compared.
+struct FeatureView {
+  double width, height;   // Full image, pixels.
+  double fx, fy, cx, cy;  // Intrinsics of the full image.
+  int64_t block;          // Side of a block, pixels.
+  int64_t rows, columns;  // Blocks.
+  double bias[3];         // Coefficients of the depth bias, 1/m.
+  double readout_s, depth_readout_s, delay_s;
+};
+
+struct Features {
+  int64_t count;
+  const double* pixels_there;  // [count, 2]
+  const double* depth_there;   // [count] meters.
+  const double* pixels_here;   // [count, 2]
+};
+
+// Camera and points whose reprojection is compared with measured pixels.
+struct Reprojection {
+  double fx, fy, cx, cy;
+  const double* T;       // [4, 4] transform of the points into the camera.
+  const double* points;  // [count, 3] meters.
+  const double* pixels;  // [count, 2]
+  int64_t count;
+};
+
+#define LDO_DECLARE(isa)                                                                         \
+  namespace isa {                                                                                \
+  void surfaces(const double* depth_m, const double* rays, int64_t height, int64_t width,        \
+                double step_ratio, double step_m, double* result);                               \
+  int64_t compare(const SurfaceView& view, const Comparison& input, Compared& result);           \
+  void compare_features(const FeatureView& view, const Comparison& input,                        \
+                        const Features& features, double* rows);                                 \
+  void reproject(const Reprojection& input, double* errors, double* derivatives, double* moved); \
   }
 LDO_DECLARE(baseline)
 LDO_DECLARE(avx2)

@@ -2,6 +2,7 @@
 // instruction set.
 #include <nanobind/stl/tuple.h>
 
+#include <algorithm>
 #include <cmath>
 #include <tuple>
 
@@ -15,15 +16,19 @@ namespace {
 struct Kernels {
   decltype(&baseline::surfaces) surfaces;
   decltype(&baseline::compare) compare;
+  decltype(&baseline::compare_features) compare_features;
+  decltype(&baseline::reproject) reproject;
 };
 
 Kernels kernels_for(Isa isa) {
 #if LDO_X86
-  if (isa == Isa::avx512) return {avx512::surfaces, avx512::compare};
-  if (isa == Isa::avx2) return {avx2::surfaces, avx2::compare};
+  if (isa == Isa::avx512)
+    return {avx512::surfaces, avx512::compare, avx512::compare_features, avx512::reproject};
+  if (isa == Isa::avx2)
+    return {avx2::surfaces, avx2::compare, avx2::compare_features, avx2::reproject};
 #endif
   (void)isa;
-  return {baseline::surfaces, baseline::compare};
+  return {baseline::surfaces, baseline::compare, baseline::compare_features, baseline::reproject};
 }
 
 Kernels chosen{};  // Set when the module is imported.
@@ -94,6 +99,84 @@ int64_t compare(const Array& there, const Array& here, const Array& basis,
   return chosen.compare(view, input, result);
 }
 
+using Coefficients = std::tuple<double, double, double>;
+using Times = std::tuple<double, double, double>;  // Readouts of color and depth, and delay.
+using Size = std::tuple<int, int>;
+
+void compare_features(const Array& there, const Array& pixels_there, const Array& depth_there,
+                      const Array& pixels_here, const Array& T_here_there,
+                      const Array& velocity_there, const Array& velocity_here,
+                      const Coefficients& bias, const Times& times_s, const Intrinsics& intrinsics,
+                      const Size& size, int block, const WritableArray& rows) {
+  const auto [width, height] = size;
+  require(block >= 1 && width >= block && height >= std::max(block, 2),
+          "block must be at least 1, and the image at least as large as a block.");
+  const auto [fx, fy, cx, cy] = intrinsics;
+  require_positive(fx, "fx");
+  require_positive(fy, "fy");
+  const int64_t across = width / block, down = height / block;
+  require_shape(there, "there", {static_cast<size_t>(across * down), kSurfaceDoubles});
+  require(depth_there.ndim() == 1, "depth_there must have shape [M].");
+  const size_t count = depth_there.shape(0);
+  require_shape(pixels_there, "pixels_there", {count, 2});
+  require_shape(pixels_here, "pixels_here", {count, 2});
+  require_shape(T_here_there, "T_here_there", {4, 4});
+  require_shape(velocity_there, "velocity_there", {6});
+  require_shape(velocity_here, "velocity_here", {6});
+  require_shape(rows, "rows", {2 * count, kRowDoubles});
+  const auto [b1, b2, b3] = bias;
+  const auto [readout_s, depth_readout_s, delay_s] = times_s;
+  const FeatureView view{static_cast<double>(width),
+                         static_cast<double>(height),
+                         fx,
+                         fy,
+                         cx,
+                         cy,
+                         block,
+                         down,
+                         across,
+                         {b1, b2, b3},
+                         readout_s,
+                         depth_readout_s,
+                         delay_s};
+  Comparison input{};
+  input.there = values_of<double>(there, "there");
+  input.T_here_there = values_of<double>(T_here_there, "T_here_there");
+  input.motion_there.velocity = values_of<double>(velocity_there, "velocity_there");
+  input.motion_here.velocity = values_of<double>(velocity_here, "velocity_here");
+  const Features features{
+      static_cast<int64_t>(count), values_of<double>(pixels_there, "pixels_there"),
+      values_of<double>(depth_there, "depth_there"), values_of<double>(pixels_here, "pixels_here")};
+  double* written = values_of<double>(rows, "rows");
+  nb::gil_scoped_release release;
+  chosen.compare_features(view, input, features, written);
+}
+
+void reproject(const Array& points, const Array& pixels, const Array& T,
+               const Intrinsics& intrinsics, const WritableArray& errors,
+               const WritableArray& derivatives, const WritableArray& moved) {
+  require(points.ndim() == 2 && points.shape(1) == 3, "points must have shape [N, 3].");
+  const size_t count = points.shape(0);
+  require_shape(pixels, "pixels", {count, 2});
+  require_shape(T, "T", {4, 4});
+  require_shape(errors, "errors", {count, 2});
+  require_shape(derivatives, "derivatives", {count, 2, 6});
+  require_shape(moved, "moved", {count, 3});
+  const auto [fx, fy, cx, cy] = intrinsics;
+  const Reprojection input{fx,
+                           fy,
+                           cx,
+                           cy,
+                           values_of<double>(T, "T"),
+                           values_of<double>(points, "points"),
+                           values_of<double>(pixels, "pixels"),
+                           static_cast<int64_t>(count)};
+  double *e = values_of<double>(errors, "errors"), *p = values_of<double>(moved, "moved");
+  double* J = values_of<double>(derivatives, "derivatives");
+  nb::gil_scoped_release release;
+  chosen.reproject(input, e, J, p);
+}
+
 }  // namespace
 
 NB_MODULE(_surfaces, m) {
@@ -103,6 +186,11 @@ NB_MODULE(_surfaces, m) {
   m.def("compare", &compare, "there"_a, "here"_a, "basis"_a, "T_here_there"_a, "velocity_there"_a,
         "velocity_here"_a, "times_s"_a, "intrinsics"_a, "block"_a, "width"_a, "stride"_a,
         "max_step_ratio"_a, "rows"_a, "depths"_a, "indices"_a);
+  m.def("compare_features", &compare_features, "there"_a, "pixels_there"_a, "depth_there"_a,
+        "pixels_here"_a, "T_here_there"_a, "velocity_there"_a, "velocity_here"_a, "bias"_a,
+        "times_s"_a, "intrinsics"_a, "size"_a, "block"_a, "rows"_a);
+  m.def("reproject", &reproject, "points"_a, "pixels"_a, "T"_a, "intrinsics"_a, "errors"_a,
+        "derivatives"_a, "moved"_a);
 }
 
 }  // namespace ldo

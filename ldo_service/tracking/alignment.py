@@ -361,10 +361,11 @@ def _contradiction(
 
 def _step(equations: NormalEquations, median_depth_m: float, config: AlignConfig) -> np.ndarray:
     hessian = equations.hessian.copy()
-    hessian[BRIGHTNESS, BRIGHTNESS] += np.diag(BRIGHTNESS_PRIOR)
-    hessian[np.diag_indices(8)] += config.damping * np.diag(hessian) + 1e-9
+    diagonal = hessian.reshape(-1)[::9]
+    diagonal[BRIGHTNESS] += BRIGHTNESS_PRIOR
+    diagonal += config.damping * diagonal + 1e-9
     step = -np.linalg.solve(hessian, equations.gradient)
-    size = max(np.linalg.norm(step[:3]), np.linalg.norm(step[3:6]) / median_depth_m)
+    size = max(se3.length(step[:3]), se3.length(step[3:6]) / median_depth_m)
     if size > config.max_step:
         step[POSE] *= config.max_step / size
     return step
@@ -375,8 +376,7 @@ def _improved(
 ) -> BrightnessModel:
     sigma = _rescaled(appearance.intensity_sigma, equations.photometric)
     scale = _rescaled(appearance.depth_noise_scale, equations.geometric)
-    return replace(
-        appearance,
+    return BrightnessModel(
         gain=appearance.gain + float(step[6]),
         bias=appearance.bias + float(step[7]),
         intensity_sigma=max(sigma, config.min_intensity_sigma),
@@ -389,8 +389,8 @@ def _rescaled(sigma: float, term: ResidualStatistics) -> float:
 
 
 def _image_motion_px(step: np.ndarray, target: Level, reference: ReferencePoints) -> float:
-    angle = np.linalg.norm(step[:3]) + np.linalg.norm(step[3:6]) / reference.median_depth_m
-    return float(angle * target.camera.fx)
+    angle = se3.length(step[:3]) + se3.length(step[3:6]) / reference.median_depth_m
+    return angle * target.camera.fx
 
 
 def _condition(hessian: np.ndarray, median_depth_m: float) -> float:

@@ -20,6 +20,7 @@ import small_gicp
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, se3
 from ldo_service.geometry.pnp import solve_pnp
+from ldo_service.kernels import _matching
 
 from .pyramid import Level, Pyramid, ReferencePoints
 
@@ -89,7 +90,16 @@ class FeaturePose:
 
 
 def detect(view: Pyramid, config: FeatureConfig) -> Features:
-    """Detect ORB features in the full-resolution image, and read the measured depth of each."""
+    """Detect ORB features in the full-resolution image, and read the measured depth of each.
+
+    The view keeps its features. A second call with the same settings returns them again.
+    """
+    if config not in view.features:
+        view.features[config] = _detected(view, config)
+    return view.features[config]
+
+
+def _detected(view: Pyramid, config: FeatureConfig) -> Features:
     orb = cv2.ORB.create(nfeatures=config.count, fastThreshold=config.fast_threshold)
     keypoints, descriptors = orb.detectAndCompute(view.gray, None)
     if descriptors is None:
@@ -157,9 +167,10 @@ def _nearest_bits(
         Index of the nearest frame descriptor, its distance, and the distance of the second
         nearest one; [N] each.
     """
-    pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(reference, frame, k=2)
-    distances = np.array([(best.distance, second.distance) for best, second in pairs])
-    return np.array([best.trainIdx for best, _ in pairs]), *distances.T
+    count = len(reference)
+    index, least, second = np.empty(count, np.int64), *np.empty((2, count), np.int32)
+    _matching.nearest(reference, frame, index, least, second)
+    return index, least, second
 
 
 def _nearest_gradients(

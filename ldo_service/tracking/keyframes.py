@@ -151,13 +151,12 @@ class ReferenceKeyframe:
         """Return the ORB features.
 
         They are detected on the first call and not earlier, because most keyframes never need any.
-        Later calls return the same features.
+        Later calls return the same features. If a frame with known features becomes a keyframe,
+        the keyframe has these features.
         """
         if self.stored_features is not None:
             return self.stored_features
-        if "_features" not in self.__dict__:
-            self.__dict__["_features"] = detect(self.view, config)
-        return self.__dict__["_features"]
+        return detect(self.view, config)
 
     def with_moved(
         self, moved_mask: np.ndarray, config: MotionSegmentationConfig

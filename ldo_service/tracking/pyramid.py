@@ -7,7 +7,8 @@ reference points are the surface points of a keyframe, to which frames are align
 Conventions: `ldo_service.geometry`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import cv2
 import numpy as np
@@ -85,6 +86,8 @@ class Pyramid:
     depth_m: np.ndarray  # [H, W] float32 meters; 0 where unknown.
     camera: Camera  # Intrinsics of the full-resolution image.
     levels: tuple[Level, ...]  # The finest first.
+    # Features of the image that are known already, by their settings; see `features.detect`.
+    features: dict[Any, Any] = field(default_factory=dict, repr=False, compare=False)
 
 
 def intrinsics(camera: Camera) -> Intrinsics:
@@ -104,7 +107,8 @@ def mask_clipped(gray: np.ndarray) -> np.ndarray:
     Returns:
         Gray levels, [H, W] float32; 0 where overexposed or already 0 (black).
     """
-    return np.where(gray < CLIPPED, gray, 0).astype(np.float32)
+    _, exposed = cv2.threshold(gray, CLIPPED - 1, 0, cv2.THRESH_TOZERO_INV)
+    return exposed.astype(np.float32)
 
 
 def halved_image(image: np.ndarray, least: int = 1) -> np.ndarray:
@@ -232,11 +236,17 @@ def build_reference(pyramid: Pyramid, ignore_mask: np.ndarray | None = None) -> 
 def _cells_of(points: np.ndarray, camera: Camera) -> np.ndarray:
     """Return the cell of the image in which each point [7, N] lies, [N] uint8."""
     columns, rows = CELLS
-    u = (camera.fx * points[0] / points[2] + camera.cx) * (columns / camera.width)
-    v = (camera.fy * points[1] / points[2] + camera.cy) * (rows / camera.height)
-    column = np.clip(u.astype(np.int32), 0, columns - 1)
-    row = np.clip(v.astype(np.int32), 0, rows - 1)
-    return (columns * row + column).astype(np.uint8)
+
+    def place(axis: int, focal: float, center: float, scale: float, count: int) -> np.ndarray:
+        pixels = focal * points[axis]
+        pixels /= points[2]
+        pixels += center
+        pixels *= scale
+        return pixels.clip(0, count - 1, out=pixels).astype(np.uint8)
+
+    column = place(0, camera.fx, camera.cx, columns / camera.width, columns)
+    row = place(1, camera.fy, camera.cy, rows / camera.height, rows)
+    return columns * row + column
 
 
 def _without(level: Level, ignore_mask: np.ndarray | None) -> Level:

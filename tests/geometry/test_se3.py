@@ -57,6 +57,24 @@ def test_quaternions_and_rotations_agree_with_scipy() -> None:
         np.testing.assert_allclose(se3.rotation(np.array([w, x, y, z]) * 3), R, atol=1e-12)
 
 
+def test_rotation_vectors_equal_those_of_scipy() -> None:
+    rng = np.random.default_rng(2)
+    vectors = rng.normal(size=(300, 3)) * 10.0 ** rng.uniform(-8, 0.5, (300, 1))
+    for R in Rotation.from_rotvec(vectors).as_matrix():
+        expected = Rotation.from_matrix(R).as_rotvec()
+        np.testing.assert_allclose(se3.rotation_vector(R), expected, rtol=1e-12, atol=1e-15)
+
+
+def test_rotation_vector_of_a_matrix_with_errors_is_that_of_the_nearest_rotation() -> None:
+    R = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
+    np.testing.assert_allclose(se3.rotation_vector(1.001 * R), [0.3, -0.2, 0.5], atol=1e-12)
+
+
+def test_quaternion_of_a_mirror_image_is_refused() -> None:
+    with pytest.raises(ValueError, match="determinant"):
+        se3.quaternion(-np.eye(3))
+
+
 @pytest.mark.parametrize("axis", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0.8, 0]])
 def test_quaternion_of_a_half_turn_keeps_its_precision(axis: list[float]) -> None:
     R = Rotation.from_rotvec(np.pi * np.array(axis)).as_matrix()

@@ -150,3 +150,48 @@ def test_wrong_shapes_are_rejected() -> None:
             there, there, grid()[1], T, *STILL, TIMES_S, INTRINSICS, BLOCK, W, 1, 0.08,
             np.empty((10, 10)), np.empty(10), np.empty((10, 2), np.int64),
         )  # fmt: skip
+
+
+def random_features() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return pixels there [M, 2], their depth [M] and pixels here [M, 2], also at the rim."""
+    rng = np.random.default_rng(1)
+    pixels = rng.uniform(-0.4, (CAMERA.width - 0.6, CAMERA.height - 0.6), (200, 2))
+    return pixels, rng.uniform(1.0, 4.0, 200), pixels + rng.normal(size=(200, 2))
+
+
+def test_comparison_of_features_equals_that_of_numpy() -> None:
+    there, (pixels, depth_m, pixels_here) = surfaces(bumpy_depth_m()), random_features()
+    bias, times_s, size = (0.01, -0.02, 0.005), (0.02, *TIMES_S), (CAMERA.width, CAMERA.height)
+    rows = np.empty((2 * len(pixels), 13))
+    given = there, pixels, depth_m, pixels_here, T
+    _surfaces.compare_features(*given, *VELOCITIES, bias, times_s, INTRINSICS, size, BLOCK, rows)
+    expected = reference.compare_features(
+        *given, VELOCITIES, np.array(bias), times_s, INTRINSICS, size, BLOCK
+    )
+    np.testing.assert_allclose(rows, expected, rtol=1e-10, atol=1e-10)
+
+
+def test_reprojection_equals_that_of_numpy() -> None:
+    pixels, depth_m, _ = random_features()
+    points = CAMERA.points_at(pixels[:, 0], pixels[:, 1], depth_m)
+    points[0, 2] = -T[2, 3]  # Near the plane of the camera center.
+    found = np.empty((200, 2)), np.empty((200, 2, 6)), np.empty((200, 3))
+    _surfaces.reproject(points, pixels, T, INTRINSICS, *found)
+    for values, expected in zip(
+        found, reference.reproject(points, pixels, T, INTRINSICS), strict=True
+    ):
+        np.testing.assert_allclose(values, expected, rtol=1e-9, atol=1e-10)
+
+
+def test_features_of_wrong_shapes_are_rejected() -> None:
+    pixels, depth_m, pixels_here = random_features()
+    rows, size = np.empty((2 * len(pixels), 13)), (CAMERA.width, CAMERA.height)
+    rest = T, *STILL, (0.0,) * 3, (0.0,) * 3, INTRINSICS, size, BLOCK, rows
+    there = surfaces(bumpy_depth_m())
+    with pytest.raises(ValueError, match="there must have shape"):
+        _surfaces.compare_features(there[1:], pixels, depth_m, pixels_here, *rest)
+    with pytest.raises(ValueError, match="pixels_here must have shape"):
+        _surfaces.compare_features(there, pixels, depth_m, pixels_here[1:], *rest)
+    outputs = np.empty((200, 2)), np.empty((200, 2, 6)), np.empty((200, 2))
+    with pytest.raises(ValueError, match="moved must have shape"):
+        _surfaces.reproject(np.ones((200, 3)), pixels, T, INTRINSICS, *outputs)

@@ -86,3 +86,79 @@ def compare(
     residual = np.sum((points - place) * n, axis=1)
     rows = np.c_[by_bias, by_times, np.cross(middle, n), n, residual]
     return rows, middle[:, 2], np.stack([a, b], axis=1)
+
+
+def reproject(
+    points: np.ndarray,
+    pixels: np.ndarray,
+    T: np.ndarray,
+    intrinsics: tuple[float, float, float, float],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return reprojection errors [N, 2], derivatives [N, 2, 6], and points in the camera [N, 3]."""
+    fx, fy, cx, cy = intrinsics
+    moved = points @ T[:3, :3].T + T[:3, 3]
+    x, y, z = moved.T
+    inverse = 1.0 / np.where(abs(z) > 1e-6, z, 1e-6)
+    a, b = x * inverse, y * inverse
+    errors = np.stack([fx * a + cx, fy * b + cy], axis=1) - pixels
+    zero = np.zeros_like(a)
+    by_u = np.stack([-a * b, 1.0 + a * a, -b, inverse, zero, -a * inverse], axis=1)
+    by_v = np.stack([-1.0 - b * b, a * b, a, zero, inverse, -b * inverse], axis=1)
+    return errors, np.stack([fx * by_u, fy * by_v], axis=1), moved
+
+
+def compare_features(
+    there: np.ndarray,
+    pixels_there: np.ndarray,
+    depth_there: np.ndarray,
+    pixels_here: np.ndarray,
+    T_here_there: np.ndarray,
+    velocities: tuple[np.ndarray, np.ndarray],
+    bias: np.ndarray,
+    times_s: tuple[float, float, float],
+    intrinsics: tuple[float, float, float, float],
+    size: tuple[int, int],
+    block: int,
+) -> np.ndarray:
+    """Return two rows of 13 values for each feature, [2 M, 13]."""
+    (width, height), (fx, fy, cx, cy) = size, intrinsics
+    readout_s, depth_readout_s, delay_s = times_s
+    R, t = T_here_there[:3, :3], T_here_there[:3, 3]
+
+    def speeds(points: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        return np.cross(velocity[:3], points) + velocity[3:]
+
+    def turned(vectors: np.ndarray, velocity: np.ndarray, during_s: np.ndarray) -> np.ndarray:
+        return vectors + np.cross(velocity[:3], vectors) * during_s[:, None]
+
+    row_there, row_here = (p[:, 1] / (height - 1) - 0.5 for p in (pixels_there, pixels_here))
+    u, v = pixels_there.T
+    rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones(len(u))], axis=1)
+    x, y = (u - (width - 1) / 2) / (width / 2), (v - (height - 1) / 2) / (width / 2)
+    basis = np.stack([x * x, x * y, y * y], axis=1)
+    measured_m = 1.0 / np.maximum(1.0 / depth_there + basis @ bias, 0.02)
+    # Speed at which the depth of fixed pixels decreases.
+    columns, rows = width // block, height // block
+    column, row = ((pixels_there + 0.5) // block).astype(int).T
+    n = there[np.clip(row, 0, rows - 1) * columns + np.clip(column, 0, columns - 1), 3:]
+    incidence = np.sum(n * rays, axis=1)
+    is_known = abs(incidence) > 0.2
+    along_n = np.sum(n * speeds(rays * measured_m[:, None], velocities[0]), axis=1)
+    z_per_s = np.where(is_known, along_n / np.where(is_known, incidence, 1.0), 0.0)
+    # The point at the time of the color row of the second view.
+    z = measured_m + z_per_s * (delay_s + (depth_readout_s - readout_s) * row_there)
+    points = rays * z[:, None]
+    speed_there = speeds(points, velocities[0])
+    at_middle = (points + speed_there * (readout_s * row_there)[:, None]) @ R.T + t
+    speed_here = speeds(at_middle, velocities[1])
+    moved = at_middle - speed_here * (readout_s * row_here)[:, None]
+    errors, by_point, _ = reproject(moved, pixels_here, np.eye(4), intrinsics)
+    by_place = by_point[..., 3:]
+    along = turned(rays, velocities[0], readout_s * row_there) @ R.T
+    along = turned(along, velocities[1], -readout_s * row_here)
+    by_bias = -(by_place @ along[..., None]) * (measured_m**2)[:, None, None] * basis[:, None]
+    by_depth = along * z_per_s[:, None]
+    by_row = by_depth * row_there[:, None]
+    by_readout = (speed_there @ R.T) * row_there[:, None] - speed_here * row_here[:, None]
+    by_times = by_place @ np.stack([by_readout - by_row, by_row, by_depth], axis=-1)
+    return np.concatenate([by_bias, by_times, by_point, errors[..., None]], axis=-1).reshape(-1, 13)
