@@ -3,7 +3,6 @@
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import tyro
@@ -11,6 +10,7 @@ import tyro
 from ldo_service.config import load_config
 from ldo_service.service.service import Service
 from ldo_service.service.state_folder import state_folder
+from ldo_service.storage.temporary_folder import temporary_folder
 from ldo_service.transport.access_control import LOCAL
 from ldo_service.transport.endpoint import DEFAULT_ENDPOINT, Endpoint
 from ldo_service.transport.keys import OF_SERVICE, TlsKeys
@@ -84,7 +84,7 @@ def serve(
         folder = state_folder(state, stack)
         if is_router and network.keys:
             network.keys.warn_of_expiry(OF_SERVICE)
-            private = stack.enter_context(TemporaryDirectory(prefix="ldo-"))  # Mode 0700.
+            private = stack.enter_context(temporary_folder())
             network = replace(network, local_socket=f"{private}/link")
         Service(
             settings,
