@@ -14,7 +14,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-PREFIX = "ldo-tmp-"  # No other folder in the folder for temporary files may have this prefix.
+# Prefix of the folders in the temporary folder; other folders there must not have it.
+PREFIX = "ldo-tmp-"
 
 
 @contextmanager
