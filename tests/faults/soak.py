@@ -52,7 +52,7 @@ MAX_GAP_S, PATIENCE_S = 60.0, 120.0
 MODELS = ("detector.model=demo", "vlm_labeller.model=demo")
 # The default of 1500 keyframes would take most of an hour.
 MAP = ("tracker.keyframes.reuse_after=500",)
-SIZES = ("keyframes", "gaussians")  # Metrics of the mapper.
+SIZES = ("keyframes", "gaussians", "keyframes_cache_mb")  # Metrics of the mapper.
 
 # Program that reads the map and its changes. Arguments: endpoint and folder of keys.
 READER = """

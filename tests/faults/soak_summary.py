@@ -5,7 +5,8 @@
 The growth of memory, descriptors and threads is fitted to steady samples. A sample is steady if the
 map has almost all of its keyframes and the last fault is at least 90 s ago. The summary also
 compares the medians of the first and the last quarter of the time after the map is complete, and of
-each part of this time between two starts of the service.
+each part of this time between two starts of the service. Each start empties the mapper's cache of
+keyframe images, which has a limit of its own. The summary therefore also shows memory without it.
 """
 
 import argparse
@@ -18,6 +19,7 @@ import numpy as np
 
 COMMANDS = ("save", "pause", "refine")
 MEASURED = ("rss_mb", "descriptors", "threads")
+NO_CACHE = "rss_without_cache_mb"  # Resident memory without the mapper's keyframe images.
 SETTLED_S = 90.0  # Time after a fault whose samples do not count as steady.
 FULL_RATIO = 0.98  # The map counts as complete with this fraction of its final keyframes.
 
@@ -55,10 +57,15 @@ def after_map(samples: list[dict[str, Any]], complete_s: float) -> list[str]:
     """Return a line for the time after the map is complete, and one for each start in it."""
     complete = [sample for sample in samples if sample["time_s"] >= complete_s]
     mains = dict.fromkeys(sample.get("main") for sample in complete)
+    measured = list(MEASURED)
+    if all("keyframes_cache_mb" in sample["mapper"] for sample in complete):
+        measured.append(NO_CACHE)
+        for sample in complete:
+            sample[NO_CACHE] = sample["rss_mb"] - sample["mapper"]["keyframes_cache_mb"]
     parts = [complete, *([s for s in complete if s.get("main") == main] for main in mains)]
     return [
         f"medians of first and last quarter, minutes {part[0]['time_s'] / 60:.1f} to "
-        f"{part[-1]['time_s'] / 60:.1f}: {'; '.join(quarters(part, name) for name in MEASURED)}"
+        f"{part[-1]['time_s'] / 60:.1f}: {'; '.join(quarters(part, name) for name in measured)}"
         for part in parts
     ]
 
