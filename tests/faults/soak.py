@@ -21,7 +21,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from tempfile import mkdtemp
@@ -227,7 +227,7 @@ class Soak:
         self._ended_by_fault: set[int] = set()
         self._releases: list[tuple[Timer, Callable[[], None]]] = []  # They end the faults.
 
-    def run(self, duration_s: float, fault_every_s: float) -> None:
+    def run(self, duration_s: float, fault_every_s: float, without: Collection[str]) -> None:
         """Start the service and the camera, and inject faults for a time."""
         tour = open_sequence("synthetic:tour")
         there = [raw_frame_to_message(tour.read(i)) for i in range(0, len(tour), STRIDE)]
@@ -241,13 +241,13 @@ class Soak:
         self.camera.start(self.service.connect("camera", self._stack))
         self._stack.callback(self.camera.stop)
         self._started_s = time.monotonic()
-        self._loop(duration_s, fault_every_s)
+        self._loop(duration_s, fault_every_s, [name for name in self.faults if name not in without])
         for timer, release in self._releases:
             if timer.is_alive():
                 timer.cancel()
                 release()
 
-    def _loop(self, duration_s: float, fault_every_s: float) -> None:
+    def _loop(self, duration_s: float, fault_every_s: float, names: Sequence[str]) -> None:
         command_every_s = min(COMMAND_S, fault_every_s / 2)
         next_command_s, next_fault_s, next_sample_s = command_every_s / 2, fault_every_s, 0.0
         commands = faults = 0
@@ -257,7 +257,7 @@ class Soak:
                 self._sample()
             elif now_s >= next_fault_s:
                 next_fault_s += fault_every_s
-                self._fault(list(self._faults)[faults % len(self._faults)])
+                self._fault(names[faults % len(names)])
                 faults += 1
             elif now_s >= next_command_s:
                 next_command_s += command_every_s
@@ -317,7 +317,7 @@ class Soak:
         self.watch.mark(self.camera.sent)
         marked_s = time.monotonic()
         self._write("fault", name=name)
-        self._faults[name](self)
+        self.faults[name](self)
         while not self.watch.first_ok_s and time.monotonic() < marked_s + PATIENCE_S:
             time.sleep(0.05)
         took_s = self.watch.first_ok_s - marked_s if self.watch.first_ok_s else None
@@ -386,7 +386,7 @@ class Soak:
 
         self._release_after(2 * HELD_S, end)
 
-    _faults = {
+    faults = {
         "optimizer killed": _kill_optimizer,
         "optimizer stopped": _stop_optimizer,
         "service killed": _kill_service,
@@ -396,12 +396,18 @@ class Soak:
     }
 
 
-def run(out: Path, settings: Sequence[str], duration_s: float, fault_every_s: float) -> bool:
+def run(
+    out: Path,
+    settings: Sequence[str],
+    duration_s: float,
+    fault_every_s: float,
+    without: Collection[str] = (),
+) -> bool:
     """Run the service, and return whether nothing was violated."""
     folder = Path(mkdtemp(prefix="ldo-soak-"))
     with ExitStack() as stack:
         soak = Soak(folder, out, settings, stack)
-        soak.run(duration_s, fault_every_s)
+        soak.run(duration_s, fault_every_s, without)
         if soak.watch.gap_s > MAX_GAP_S:
             soak.violation(f"no pose came for {soak.watch.gap_s:.0f} s")
     if soak.violations:
@@ -419,8 +425,15 @@ def main() -> None:
     parser.add_argument(
         "--set", dest="settings", action="append", default=[], help="setting of the service"
     )
+    parser.add_argument(
+        "--without",
+        action="append",
+        default=[],
+        choices=list(Soak.faults),
+        help="fault to leave out",
+    )
     given = parser.parse_args()
-    held = run(given.out, given.settings, 60 * given.minutes, given.fault_every_s)
+    held = run(given.out, given.settings, 60 * given.minutes, given.fault_every_s, given.without)
     print(summary(read_lines(given.out)))
     raise SystemExit(not held)
 
