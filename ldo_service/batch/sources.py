@@ -6,7 +6,6 @@ not a recording itself stands for the recordings directly in it. A pattern such 
 """
 
 import hashlib
-import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -14,6 +13,7 @@ from pathlib import Path, PurePosixPath
 from ldo_service.datasets import find_layout
 from ldo_service.errors import ConfigError, DataError, LdoError
 from ldo_service.storage.atomic_write import UNFINISHED
+from ldo_service.storage.temporary_folder import temporary_folder
 
 from .store import Entry, open_store
 
@@ -159,8 +159,8 @@ def _is_recording(entry: Entry) -> bool:
     store = entry.store
     if store.is_local:
         return find_layout(store.local) is not None
-    with tempfile.TemporaryDirectory(prefix="ldo-names-") as folder:
-        mirror = Path(folder) / (store.name or "bucket")
+    with temporary_folder() as folder:
+        mirror = folder / (store.name or "bucket")
         if entry.is_file:
             mirror.touch()
         else:

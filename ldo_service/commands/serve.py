@@ -3,7 +3,6 @@
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import tyro
@@ -12,6 +11,7 @@ from ldo_service.config import load_config
 from ldo_service.errors import ConfigError
 from ldo_service.service.service import Service
 from ldo_service.service.state_folder import state_folder
+from ldo_service.storage.temporary_folder import temporary_folder
 from ldo_service.transport.access_control import LOCAL
 from ldo_service.transport.endpoint import DEFAULT_ENDPOINT, Endpoint
 from ldo_service.transport.keys import OF_SERVICE, OTHERS, TlsKeys
@@ -98,7 +98,7 @@ def serve(
         folder = state_folder(state, stack)
         if is_router and network.keys:
             network.keys.warn_of_expiry(OF_SERVICE)
-            private = stack.enter_context(TemporaryDirectory(prefix="ldo-"))  # Mode 0700.
+            private = stack.enter_context(temporary_folder())
             network = replace(network, local_socket=str(local_socket or f"{private}/link"))
         Service(
             settings,

@@ -4,7 +4,6 @@ import asyncio
 import time
 from collections.abc import Sequence as Ordered
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from ldo_service.actors.topology import GRAPH, ActorSpec
 from ldo_service.config import actor_parameters, config_yaml, stage_parameters
@@ -14,6 +13,7 @@ from ldo_service.runtime.stage import Stage
 from ldo_service.runtime.supervision import StopRequest, supervise
 from ldo_service.schemas import Health, decode, encode
 from ldo_service.schemas.topics import CAMERA_RGBD, ODOMETRY_PRIOR, Topic
+from ldo_service.storage.temporary_folder import temporary_folder
 from ldo_service.transport.flow_control import Header, data_key, encode_link
 from ldo_service.transport.interface import MemoryTransport
 
@@ -42,8 +42,8 @@ def run_realtime(job: RunOptions, advance: Advance) -> RunWriter:
     """
     if job.refine:
         raise ConfigError("--refine-iterations needs an offline run. Remove --realtime.")
-    with TemporaryDirectory(prefix="ldo-map-") as folder:
-        return asyncio.run(_RealTimeRun(job, Path(folder), advance).go())
+    with temporary_folder() as folder:
+        return asyncio.run(_RealTimeRun(job, folder, advance).go())
 
 
 class _RealTimeRun:

@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import msgspec
@@ -20,6 +19,7 @@ from ldo_service.kernels.gpu.device import Device, gpu_facts
 from ldo_service.recordings.recording import JournalFile, recorded_actors
 from ldo_service.recordings.replay import ReplayReport, replay
 from ldo_service.runtime import Actor
+from ldo_service.storage.temporary_folder import temporary_folder
 from ldo_service.storage.yaml_io import load_yaml
 
 
@@ -43,8 +43,8 @@ class RecordedActor:
         Raises:
             DataError: A file cannot be read.
         """
-        with TemporaryDirectory(prefix="ldo-replay-") as folder:
-            files = Path(folder) / "map"
+        with temporary_folder() as folder:
+            files = folder / "map"
             make = partial(self._make, files)
             has_files = self.name == Mapper.name
             return replay(self.name, self.files, make, advance, files if has_files else None)

@@ -4,7 +4,6 @@ import errno
 import fcntl
 import logging
 import os
-import tempfile
 from collections.abc import Collection
 from contextlib import ExitStack
 from pathlib import Path
@@ -24,6 +23,7 @@ from ldo_service.storage.atomic_write import make_folder, sync, write_atomically
 from ldo_service.storage.saved_files import SavedFiles
 from ldo_service.storage.state_contents import require_known_versions
 from ldo_service.storage.state_store import CONTENTS, FolderStore
+from ldo_service.storage.temporary_folder import temporary_folder
 
 log = logging.getLogger(__name__)
 
@@ -53,7 +53,7 @@ def state_folder(folder: Path | None, stack: ExitStack) -> Path:
         UnavailableError: The folder cannot be written now.
     """
     if folder is None:
-        return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ldo-")))
+        return stack.enter_context(temporary_folder())
     try:
         make_folder(folder)
         if not os.access(folder, os.W_OK):

@@ -7,9 +7,7 @@ are written, so a power cut may damage them until the caller has synced `unsynce
 
 import errno
 import logging
-import shutil
 import struct
-import tempfile
 import weakref
 import zlib
 from pathlib import Path
@@ -17,6 +15,7 @@ from pathlib import Path
 from ldo_service.errors import ConfigError, DataError
 
 from .atomic_write import UNFINISHED, make_folder, write_atomically
+from .temporary_folder import make_temporary_folder, remove_temporary_folder
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +44,7 @@ class ChecksummedFolder:
             ConfigError: The folder cannot be used.
         """
         self.is_temporary = folder is None
-        self._folder = folder or _temporary_folder(self, suffix)
+        self._folder = folder or _temporary_folder(self)
         self._suffix, self._consequence = suffix, consequence
         self._is_refusing = False
         self.not_written = 0
@@ -150,7 +149,7 @@ def read_checked(path: Path) -> memoryview:
     return body
 
 
-def _temporary_folder(owner: object, name: str) -> Path:
-    folder = Path(tempfile.mkdtemp(prefix=f"ldo-{name}-"))
-    weakref.finalize(owner, shutil.rmtree, folder, ignore_errors=True)
+def _temporary_folder(owner: object) -> Path:
+    folder, lock = make_temporary_folder()
+    weakref.finalize(owner, remove_temporary_folder, folder, lock)
     return folder

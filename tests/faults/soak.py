@@ -3,10 +3,12 @@
     .venv/bin/python -m tests.faults.soak soak.jsonl --minutes 60
     .venv/bin/python -m tests.faults.soak_summary soak.jsonl
 
-A camera moves to and fro through the synthetic tour at 2 Hz. One fault follows every five minutes,
-and one command every minute. The file gets a JSON object for each sample, command and fault. The
-second program summarizes such a file. The exit code is 1 if no pose came for longer than 60 s, if
-a process ended that no fault ended, or if a command was refused.
+A camera moves to and fro through the synthetic tour and sends every second frame of it at 2 Hz. The
+map is complete with 500 keyframes, whose images fill the default memory for them. A fault follows
+every five minutes, and a command every minute. The file gets a JSON object for each sample, command
+and fault. The second program summarizes such a file. The exit code is 1 if no pose came for longer
+than 60 s, if a process ended that no fault ended, if a command was refused, or if there is more
+than one temporary folder of the service.
 """
 
 import argparse
@@ -19,11 +21,11 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from tempfile import mkdtemp
-from threading import Event, Lock, Thread
+from threading import Event, Lock, Thread, Timer
 from typing import Any
 
 from ldo_service.client import Client, connect
@@ -43,11 +45,14 @@ from .service_process import children_of
 from .soak_summary import COMMANDS, MEASURED, read_lines, summary
 
 RATE_HZ, SAMPLE_S, COMMAND_S, PAUSE_S = 2.0, 10.0, 60.0, 2.0
+STRIDE = 2  # Every second frame of the tour, so that the map is complete early.
 SYSTEMD_PAUSE_S = 5.0  # RestartSec in deploy/ldo@.service.
 STOP_S, HELD_S, CONNECTIONS = 15.0, 60.0, 100
 MAX_GAP_S, PATIENCE_S = 60.0, 120.0
 MODELS = ("detector.model=demo", "vlm_labeller.model=demo")
-SIZES = ("keyframes", "gaussians")  # Metrics of the mapper.
+# The default of 1500 keyframes would take most of an hour.
+MAP = ("tracker.keyframes.reuse_after=500",)
+SIZES = ("keyframes", "gaussians", "keyframes_cache_mb")  # Metrics of the mapper.
 
 # Program that reads the map and its changes. Arguments: endpoint and folder of keys.
 READER = """
@@ -67,12 +72,14 @@ class Service:
 
     def __init__(self, folder: Path, settings: Sequence[str]) -> None:
         self._folder, self.keys = folder, folder / "keys"
-        self._settings = [word for one in (*MODELS, *settings) for word in ("--set", one)]
+        self._settings = [word for one in (*MODELS, *MAP, *settings) for word in ("--set", one)]
         authority = CertificateAuthority.new(self.keys, days=400)
         for role in ("service", "camera", "operator", "viewer"):
             authority.add(role, role, "robot", days=365)
         self.port = free_port()
         self.endpoint = f"tls/127.0.0.1:{self.port}"
+        self._temporary = folder / "tmp"
+        self._temporary.mkdir()
 
     def start(self) -> None:
         """Start the service, and do not wait for it."""
@@ -84,7 +91,12 @@ class Service:
                     *("--keys", keys, "--state", state, *self._settings),
                 ],
                 stderr=log,
+                env={**os.environ, "TMPDIR": str(self._temporary)},
             )
+
+    def temporary_folders(self) -> int:
+        """Return the number of temporary folders that the processes made and did not remove."""
+        return len(list(self._temporary.glob("ldo-*")))
 
     def pids(self) -> set[int]:
         """Return the processes of the service."""
@@ -213,13 +225,12 @@ class Soak:
         self._started_s = time.monotonic()
         self._processes: set[int] = set()
         self._ended_by_fault: set[int] = set()
-        # Time and function that ends a fault.
-        self._releases: list[tuple[float, Callable[[], None]]] = []
+        self._releases: list[tuple[Timer, Callable[[], None]]] = []  # They end the faults.
 
-    def run(self, duration_s: float, fault_every_s: float) -> None:
+    def run(self, duration_s: float, fault_every_s: float, without: Collection[str]) -> None:
         """Start the service and the camera, and inject faults for a time."""
         tour = open_sequence("synthetic:tour")
-        there = [raw_frame_to_message(tour.read(i)) for i in range(len(tour))]
+        there = [raw_frame_to_message(tour.read(i)) for i in range(0, len(tour), STRIDE)]
         self.service.start()
         self._stack.callback(self.service.kill)
         self.operator = self.service.connect("operator", self._stack)
@@ -230,24 +241,23 @@ class Soak:
         self.camera.start(self.service.connect("camera", self._stack))
         self._stack.callback(self.camera.stop)
         self._started_s = time.monotonic()
-        self._loop(duration_s, fault_every_s)
-        for _, release in self._releases:
-            release()
+        self._loop(duration_s, fault_every_s, [name for name in self.faults if name not in without])
+        for timer, release in self._releases:
+            if timer.is_alive():
+                timer.cancel()
+                release()
 
-    def _loop(self, duration_s: float, fault_every_s: float) -> None:
+    def _loop(self, duration_s: float, fault_every_s: float, names: Sequence[str]) -> None:
         command_every_s = min(COMMAND_S, fault_every_s / 2)
         next_command_s, next_fault_s, next_sample_s = command_every_s / 2, fault_every_s, 0.0
         commands = faults = 0
         while (now_s := self._now_s()) < duration_s:
-            for due in [due for due in self._releases if due[0] <= now_s]:
-                self._releases.remove(due)
-                due[1]()
             if now_s >= next_sample_s:
                 next_sample_s += SAMPLE_S
                 self._sample()
             elif now_s >= next_fault_s:
                 next_fault_s += fault_every_s
-                self._fault(list(self._faults)[faults % len(self._faults)])
+                self._fault(names[faults % len(names)])
                 faults += 1
             elif now_s >= next_command_s:
                 next_command_s += command_every_s
@@ -277,7 +287,11 @@ class Soak:
             )
         self._processes = set(sizes)
         total = {name: sum(size[name] for size in sizes.values()) for name in MEASURED}
-        self._write("sample", **total, **self.watch.state(), processes=sizes, sent=self.camera.sent)
+        total["temporary_folders"] = self.service.temporary_folders()
+        if total["temporary_folders"] > 1:
+            self.violation(f"there are {total['temporary_folders']} temporary folders")
+        main, sent = self.service.process.pid, self.camera.sent
+        self._write("sample", **total, **self.watch.state(), main=main, processes=sizes, sent=sent)
 
     def _command(self, name: str) -> None:
         started_s = time.monotonic()
@@ -303,14 +317,18 @@ class Soak:
         self.watch.mark(self.camera.sent)
         marked_s = time.monotonic()
         self._write("fault", name=name)
-        self._faults[name](self)
+        self.faults[name](self)
         while not self.watch.first_ok_s and time.monotonic() < marked_s + PATIENCE_S:
             time.sleep(0.05)
         took_s = self.watch.first_ok_s - marked_s if self.watch.first_ok_s else None
         self._write("recovered", name=name, first_ok_s=took_s)
 
     def _release_after(self, duration_s: float, release: Callable[[], None]) -> None:
-        self._releases.append((self._now_s() + duration_s, release))
+        """End a fault in time, even if a command waits for that end."""
+        timer = Timer(duration_s, release)
+        timer.daemon = True
+        timer.start()
+        self._releases.append((timer, release))
 
     def _kill_optimizer(self) -> None:
         pid = self.watch.health["optimizer"].pid
@@ -368,7 +386,7 @@ class Soak:
 
         self._release_after(2 * HELD_S, end)
 
-    _faults = {
+    faults = {
         "optimizer killed": _kill_optimizer,
         "optimizer stopped": _stop_optimizer,
         "service killed": _kill_service,
@@ -378,12 +396,18 @@ class Soak:
     }
 
 
-def run(out: Path, settings: Sequence[str], duration_s: float, fault_every_s: float) -> bool:
+def run(
+    out: Path,
+    settings: Sequence[str],
+    duration_s: float,
+    fault_every_s: float,
+    without: Collection[str] = (),
+) -> bool:
     """Run the service, and return whether nothing was violated."""
     folder = Path(mkdtemp(prefix="ldo-soak-"))
     with ExitStack() as stack:
         soak = Soak(folder, out, settings, stack)
-        soak.run(duration_s, fault_every_s)
+        soak.run(duration_s, fault_every_s, without)
         if soak.watch.gap_s > MAX_GAP_S:
             soak.violation(f"no pose came for {soak.watch.gap_s:.0f} s")
     if soak.violations:
@@ -401,8 +425,15 @@ def main() -> None:
     parser.add_argument(
         "--set", dest="settings", action="append", default=[], help="setting of the service"
     )
+    parser.add_argument(
+        "--without",
+        action="append",
+        default=[],
+        choices=list(Soak.faults),
+        help="fault to leave out",
+    )
     given = parser.parse_args()
-    held = run(given.out, given.settings, 60 * given.minutes, given.fault_every_s)
+    held = run(given.out, given.settings, 60 * given.minutes, given.fault_every_s, given.without)
     print(summary(read_lines(given.out)))
     raise SystemExit(not held)
 

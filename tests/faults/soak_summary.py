@@ -3,7 +3,10 @@
     .venv/bin/python -m tests.faults.soak_summary soak.jsonl
 
 The growth of memory, descriptors and threads is fitted to steady samples. A sample is steady if the
-map has almost all of its keyframes and the last fault is at least 90 s ago.
+map has almost all of its keyframes and the last fault is at least 90 s ago. The summary also
+compares the medians of the first and the last quarter of the time after the map is complete, and of
+each part of this time between two starts of the service. Each start empties the mapper's cache of
+keyframe images, which has a limit of its own. The summary therefore also shows memory without it.
 """
 
 import argparse
@@ -16,6 +19,7 @@ import numpy as np
 
 COMMANDS = ("save", "pause", "refine")
 MEASURED = ("rss_mb", "descriptors", "threads")
+NO_CACHE = "rss_without_cache_mb"  # Resident memory without the mapper's keyframe images.
 SETTLED_S = 90.0  # Time after a fault whose samples do not count as steady.
 FULL_RATIO = 0.98  # The map counts as complete with this fraction of its final keyframes.
 
@@ -35,6 +39,35 @@ def growth_per_hour(samples: list[dict[str, Any]], name: str) -> float:
         slopes += float(np.sum((hours - hours.mean()) * (values - values.mean())))
         spread += float(np.sum((hours - hours.mean()) ** 2))
     return slopes / spread if spread else float("nan")
+
+
+def quarters(samples: list[dict[str, Any]], name: str) -> str:
+    """Return the medians of the first and the last quarter of the samples, and their difference."""
+    count = max(len(samples) // 4, 1)
+    first, last = samples[:count], samples[-count:]
+    before, after = (float(np.median([s[name] for s in part])) for part in (first, last))
+    hours = (
+        float(np.mean([s["time_s"] for s in last]) - np.mean([s["time_s"] for s in first])) / 3600
+    )
+    per_hour = 100 * (after / before - 1) / hours if hours else float("nan")
+    return f"{name} {before:.1f} to {after:.1f}, {per_hour:+.1f} % per hour"
+
+
+def after_map(samples: list[dict[str, Any]], complete_s: float) -> list[str]:
+    """Return a line for the time after the map is complete, and one for each start in it."""
+    complete = [sample for sample in samples if sample["time_s"] >= complete_s]
+    mains = dict.fromkeys(sample.get("main") for sample in complete)
+    measured = list(MEASURED)
+    if all("keyframes_cache_mb" in sample["mapper"] for sample in complete):
+        measured.append(NO_CACHE)
+        for sample in complete:
+            sample[NO_CACHE] = sample["rss_mb"] - sample["mapper"]["keyframes_cache_mb"]
+    parts = [complete, *([s for s in complete if s.get("main") == main] for main in mains)]
+    return [
+        f"medians of first and last quarter, minutes {part[0]['time_s'] / 60:.1f} to "
+        f"{part[-1]['time_s'] / 60:.1f}: {'; '.join(quarters(part, name) for name in measured)}"
+        for part in parts
+    ]
 
 
 def summary(lines: list[dict[str, Any]]) -> str:
@@ -75,11 +108,12 @@ def summary(lines: list[dict[str, Any]]) -> str:
         and not any(0 <= sample["time_s"] - fault_s <= SETTLED_S for fault_s in faults_s)
     ]
     text.append(f"the map is complete after {complete_s:.0f} s; {len(steady)} steady samples")
-    quarters = [i * duration_s / 4 for i in range(1, 5)]
+    text += after_map(samples, complete_s)
+    ends_s = [i * duration_s / 4 for i in range(1, 5)]
     for name in MEASURED:
         means = [
             np.mean([s[name] for s in samples if start_s <= s["time_s"] <= end_s])
-            for start_s, end_s in pairwise(quarters)
+            for start_s, end_s in pairwise(ends_s)
         ]
         growth = growth_per_hour(steady, name)
         shown = ", ".join(f"{mean:.1f}" for mean in means)

@@ -57,6 +57,30 @@ def test_poses_are_received_over_tls_and_roles_are_enforced(tmp_path: Path) -> N
 
 
 @pytest.mark.slow
+def test_temporary_folders_of_a_killed_service_are_removed_at_the_next_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    temporary = tmp_path / "t"
+    temporary.mkdir()
+    monkeypatch.setenv("TMPDIR", str(temporary))
+    keys = CertificateAuthority.new(tmp_path / "keys", days=2).add("mule", "service", "robot", 1)
+    arguments = ("--endpoint", f"tls/127.0.0.1:{free_port()}", "--keys", str(keys))
+    left = set[Path]()
+
+    def has_new_socket() -> bool:
+        return not left.issuperset(temporary.glob("ldo-*/link"))
+
+    found = []
+    for state in ((), (), ("--state", str(tmp_path / "s"))):
+        with subprocess.Popen([*LDO, "serve", *arguments, *state]) as service:
+            wait_until(has_new_socket, 40, "a new socket")
+            service.kill()
+        left |= set(temporary.glob("ldo-*/link"))
+        found.append(len(list(temporary.glob("ldo-*"))))
+    assert found == [2, 2, 1]  # One has the socket, and the other one a temporary state.
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("shift_days", [-3, 3], ids=["expired", "not valid yet"])
 def test_invalid_certificate_of_the_robot_stops_no_actor(tmp_path: Path, shift_days: int) -> None:
     authority = CertificateAuthority.new(tmp_path / "keys", days=30)
