@@ -28,8 +28,13 @@ log = logging.getLogger(__name__)
 MAX_DELIVERIES = 3  # Deliveries after which a message that ended its process is not handled again.
 MAX_FILES = 20  # Messages that are kept on the disk; older ones are deleted.
 SUFFIX = ".message"
+MAX_SUSPECTS = (
+    8  # Messages whose deliveries are kept; those with the oldest deliveries are dropped.
+)
 _RECORD = struct.Struct("<16sII")  # Digest of the last message, its deliveries, all quarantined.
-_CHECKSUM = struct.Struct("<I")  # CRC-32 of the record, after it.
+_SUSPECT = struct.Struct("<16sI")  # Digest of an earlier message, its deliveries; 0 if unused.
+_CHECKSUM = struct.Struct("<I")  # CRC-32 of everything before it.
+_SUSPECTS_SIZE = (MAX_SUSPECTS - 1) * _SUSPECT.size
 
 
 class QuarantinedMessage(msgspec.Struct, frozen=True, kw_only=True):
@@ -45,12 +50,14 @@ class QuarantinedMessage(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Quarantine:
-    """Delivery count of the current message, and folder of quarantined messages.
+    """Delivery counts of messages that may have ended the process, and of the current message.
 
     Before a stage handles a message of a lossless input, it writes to disk how often the message
     was delivered. If the process ends during the handling, the restarted stage receives the message
     again. The message is then suspected to have ended the process. After `MAX_DELIVERIES`
-    deliveries, the stage writes the message to the folder instead of handling it.
+    deliveries, the stage writes the message to the folder instead of handling it. The restarted
+    stage may first receive messages of other inputs, or messages whose steps were not saved. The
+    count of a suspected message stays until that message itself is handled.
 
     The actors of one process handle only one suspected message at a time. If the process ends
     again, the counts of the other suspected messages stay the same. Messages of inputs that are not
@@ -68,7 +75,8 @@ class Quarantine:
             suspects: Lock of this process for the handling of suspected messages.
         """
         self._folder, self._suspects = folder, suspects or asyncio.Lock()
-        self._key, self._deliveries, self.count = b"", 0, 0
+        self._deliveries: dict[bytes, int] = {}  # By digest; the last delivered message is last.
+        self._key, self.count = b"", 0  # Digest of the message that is being handled.
         if folder is not None:
             self._load()
 
@@ -89,25 +97,27 @@ class Quarantine:
             return
         is_suspect = self._deliveries_of(delivery) > 0
         async with self._suspects if is_suspect else nullcontext():
-            self._store(_key_of(delivery), self._deliveries_of(delivery) + 1)
+            self._key = _key_of(delivery)
+            self._store(self._key, self._deliveries_of(delivery) + 1)
             try:
                 yield
             except Exception:
-                self._store(b"", 0)
+                self._clear()
                 raise
-            self._store(b"", 0)
+            self._clear()
 
     def withdraw(self) -> None:
         """Decrement the delivery count of a message whose handling was cancelled by a stop."""
-        if self._deliveries:
-            self._store(self._key, self._deliveries - 1)
+        if deliveries := self._deliveries.get(self._key, 0):
+            self._store(self._key, deliveries - 1)
 
     def add(self, actor: str, delivery: Delivery) -> int:
         """Write a message to the quarantine folder, log an error, and return the new `count`."""
         assert self._folder is not None
         self.count += 1
-        deliveries = self._deliveries
-        self._store(self._key, deliveries)  # The message stays due until the stage has saved.
+        deliveries = self._deliveries_of(delivery)
+        # The message stays due until the stage has saved.
+        self._store(_key_of(delivery), deliveries)
         header, topic = delivery.header, delivery.port.topic.name
         path = self._folder / f"{topic.replace('/', '.')}-{header.epoch}-{header.seq}{SUFFIX}"
         message = QuarantinedMessage(
@@ -138,32 +148,53 @@ class Quarantine:
         return self._folder / "deliveries"
 
     def _deliveries_of(self, delivery: Delivery) -> int:
-        is_last = self._deliveries and _is_repeated(delivery) and self._key == _key_of(delivery)
-        return self._deliveries if is_last else 0
+        return self._deliveries.get(_key_of(delivery), 0) if _is_repeated(delivery) else 0
+
+    def _clear(self) -> None:
+        self._store(self._key, 0)
+        self._key = b""
 
     def _load(self) -> None:
         with suppress(OSError):
             body = self._path.read_bytes()
-            record, checksum = body[: _RECORD.size], body[_RECORD.size :]
-            # A record without checksum is of an older version.
-            if len(body) == _RECORD.size or checksum == _CHECKSUM.pack(zlib.crc32(record)):
-                self._key, self._deliveries, self.count = _RECORD.unpack(record)
-            else:
+            # A record without checksum, or without suspects, is of an older version.
+            content, checksum = body[: -_CHECKSUM.size], body[-_CHECKSUM.size :]
+            if len(body) == _RECORD.size:
+                content = body
+            elif checksum != _CHECKSUM.pack(zlib.crc32(content)) or len(content) not in (
+                _RECORD.size,
+                _RECORD.size + _SUSPECTS_SIZE,
+            ):
                 log.error(
                     "%s is damaged: the counts of repeated messages start again at 0. Check the "
                     "disk, unless the power failed.",
                     self._path,
                 )
+                return
+            key, deliveries, self.count = _RECORD.unpack(content[: _RECORD.size])
+            suspects = [*_SUSPECT.iter_unpack(content[_RECORD.size :])][::-1]
+            self._deliveries = {k: n for k, n in (*suspects, (key, deliveries)) if n}
 
     def _store(self, key: bytes, deliveries: int) -> None:
-        """Write the count; without disk space, the count of this process is lost with it."""
-        self._key, self._deliveries = key, deliveries
+        """Write the count of a message; without disk space, it is lost with this process.
+
+        Args:
+            key: Digest of the message.
+            deliveries: The count; 0 deletes it.
+        """
+        self._deliveries.pop(key, None)
+        if deliveries:
+            self._deliveries[key] = deliveries
+        while len(self._deliveries) > MAX_SUSPECTS:
+            del self._deliveries[next(iter(self._deliveries))]
+        (last, *others) = [*reversed(self._deliveries.items())] or [(b"", 0)]
+        content = _RECORD.pack(*last, self.count) + b"".join(_SUSPECT.pack(*one) for one in others)
+        content = content.ljust(_RECORD.size + _SUSPECTS_SIZE, b"\0")
         with suppress(OSError):
             self._path.parent.mkdir(parents=True, exist_ok=True)
             descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT, 0o600)
             try:
-                record = _RECORD.pack(key, deliveries, self.count)
-                os.pwrite(descriptor, record + _CHECKSUM.pack(zlib.crc32(record)), 0)
+                os.pwrite(descriptor, content + _CHECKSUM.pack(zlib.crc32(content)), 0)
             finally:
                 os.close(descriptor)
 

@@ -1,6 +1,8 @@
 """Command `ldo` with faults that files in the folder of the variable FAULT_FOLDER switch on.
 
 - `hang-ACTOR`: The next step of that actor hangs, and the file is removed.
+- `poison`: The next keyframe of the optimizer becomes poison: each time the optimizer handles it,
+  it kills its process. The file becomes `poison-KEYFRAME`, with a line for each of these times.
 - `bad_network`: Messages are lost, late and out of order while the file exists.
 - `bad_disk`: Renames, removals, syncs and new folders often fail while the file exists.
 - `refusals`: The service appends a byte for each disk call that failed on purpose.
@@ -8,6 +10,7 @@
 
 import errno
 import os
+import signal
 import sys
 import time
 from collections.abc import Callable
@@ -19,12 +22,14 @@ from typing import Any
 from ldo_service.commands import cli
 from ldo_service.runtime import Actor
 from ldo_service.runtime.stage import Stage
+from ldo_service.schemas import KeyframeMeasurements
 from ldo_service.service import service
 from ldo_service.transport.interface import OnMessage
 from ldo_service.transport.zenoh_transport import ZenohTransport
 
 FOLDER = Path(os.environ["FAULT_FOLDER"])
 BAD_NETWORK, BAD_DISK = FOLDER / "bad_network", FOLDER / "bad_disk"
+POISON = FOLDER / "poison"
 LOST, LATE, MAX_DELAY_S = 0.15, 0.4, 0.3  # Fractions of the messages, and their maximum delay.
 REFUSED, REASONS = 0.5, (errno.ENOSPC, errno.EIO, errno.EROFS)  # Fraction of calls, and errors.
 REFUSALS = "refusals"
@@ -44,9 +49,27 @@ def hanging(actor: Actor) -> Actor:
     return actor
 
 
+def poisoned(actor: Actor) -> Actor:
+    handle = actor.handle
+
+    def die_or_handle(message: object):
+        if isinstance(message, KeyframeMeasurements):
+            deliveries = POISON.with_name(f"{POISON.name}-{message.keyframe}")
+            if POISON.exists():
+                POISON.rename(deliveries)
+            if deliveries.exists():
+                with deliveries.open("a") as lines:
+                    print(time.time(), file=lines)
+                os.kill(os.getpid(), signal.SIGKILL)
+        return handle(message)
+
+    actor.handle = die_or_handle
+    return actor
+
+
 class FaultyStage(Stage):
     def __init__(self, make: Callable[[], Actor], *args: Any, **options: Any) -> None:
-        super().__init__(lambda: hanging(make()), *args, **options)
+        super().__init__(lambda: poisoned(hanging(make())), *args, **options)
 
 
 class BadTransport(ZenohTransport):

@@ -1,7 +1,9 @@
 """Tests of messages that end the process of their actor."""
 
 import asyncio
+import struct
 import sys
+import zlib
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -18,8 +20,10 @@ from ldo_service.runtime.process import ChildProcess
 from ldo_service.runtime.quarantine import (
     MAX_DELIVERIES,
     MAX_FILES,
+    MAX_SUSPECTS,
     Quarantine,
     QuarantinedMessage,
+    _key_of,
 )
 from ldo_service.runtime.supervision import StopRequest, supervise
 from ldo_service.transport.flow_control import Header
@@ -90,6 +94,54 @@ async def test_deliveries_are_counted_across_processes_until_a_success(tmp_path:
     assert not Quarantine(tmp_path).is_due(good)
 
 
+async def test_count_stays_when_another_message_is_handled_between_two_deliveries(
+    tmp_path: Path,
+) -> None:
+    poison, good = delivery(7), delivery(3)
+    for _ in range(MAX_DELIVERIES):
+        quarantine = Quarantine(tmp_path)
+        assert not quarantine.is_due(poison)
+        async with quarantine.counting(good):
+            pass
+        await end_process_while_handling(tmp_path, poison)
+    quarantine = Quarantine(tmp_path)
+    async with quarantine.counting(good):
+        pass
+    assert quarantine.is_due(poison)
+    quarantine.add("collector", poison)
+    assert Quarantine(tmp_path).is_due(poison)
+    assert Quarantine(tmp_path).count == 1
+
+
+async def test_stop_does_not_change_the_count_of_a_message_that_was_not_delivered_again(
+    tmp_path: Path,
+) -> None:
+    await end_process_while_handling(tmp_path, delivery(7))
+    Quarantine(tmp_path).withdraw()
+    assert Quarantine(tmp_path)._deliveries_of(delivery(7)) == 1
+
+
+async def test_number_of_counts_is_limited(tmp_path: Path) -> None:
+    for seq in range(MAX_SUSPECTS + 2):
+        await end_process_while_handling(tmp_path, delivery(seq))
+    size = (tmp_path / "deliveries").stat().st_size
+    async with Quarantine(tmp_path).counting(delivery(100)):
+        pass
+    counts = [Quarantine(tmp_path)._deliveries_of(delivery(s)) for s in range(MAX_SUSPECTS + 2)]
+    assert counts == [0] * 3 + [1] * (MAX_SUSPECTS - 1)
+    assert (tmp_path / "deliveries").stat().st_size == size
+
+
+@pytest.mark.parametrize("has_checksum", [False, True])
+async def test_count_of_an_older_version_is_read(tmp_path: Path, has_checksum: bool) -> None:
+    one = delivery(7)
+    record = struct.pack("<16sII", _key_of(one), MAX_DELIVERIES, 4)
+    checksum = struct.pack("<I", zlib.crc32(record)) if has_checksum else b""
+    (tmp_path / "deliveries").write_bytes(record + checksum)
+    assert Quarantine(tmp_path).is_due(one)
+    assert Quarantine(tmp_path).count == 4
+
+
 async def test_handler_that_raises_is_not_counted(tmp_path: Path) -> None:
     for _ in range(MAX_DELIVERIES):
         with pytest.raises(ValueError, match="handler"):
@@ -138,7 +190,7 @@ async def test_suspected_messages_of_a_process_are_handled_one_at_a_time(tmp_pat
         await end_process()
     waiting[0].cancel()
     for actor, count in (("guilty", 2), ("innocent", 1)):
-        assert Quarantine(tmp_path / actor)._deliveries == count
+        assert Quarantine(tmp_path / actor)._deliveries_of(delivery(1)) == count
 
 
 async def test_folder_keeps_the_newest_messages_and_the_full_count(tmp_path: Path) -> None:
