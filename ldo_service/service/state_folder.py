@@ -121,7 +121,7 @@ def claim_state(folder: Path, stack: ExitStack, remote_actors: Collection[str] =
 def _check_states(folder: Path, remote_actors: Collection[str]) -> None:
     """Check the states in a locked folder, and fall back if they are damaged; see `claim_state`."""
     store = FolderStore(folder / "state")
-    require_known_versions(store.folder)  # Before files are deleted to finish a reset.
+    require_known_versions(store.folder)  # Finishing a reset deletes files.
     _complete_reset(folder, store, remote_actors)
     found = {path.parent.name for path in store.folder.glob("*/*.msgpack")}
     try:

@@ -114,7 +114,7 @@ class Batch:
             folder, self.recorder, (*apart, *synced), has_defaults=has_defaults
         )
         self.service.on_end = self._start_again
-        # With default settings, a step of any other actor may take ten minutes.
+        # By default, a step of any other actor may take ten minutes, also in a stopped process.
         self.hanging = ("tracker", "mapper") if has_defaults else STATEFUL
         self.camera = CameraStream(scene, RATE_HZ)
         self.truth = true_poses()
@@ -209,7 +209,7 @@ class Batch:
 
     def _stop(self, outcome: Outcome) -> None:
         """Stop a process with SIGSTOP; the supervisor kills it because it is silent."""
-        outcome.what = self.rng.choice(STATEFUL)
+        outcome.what = self.rng.choice(self.hanging)
         self._end(outcome.what, signal.SIGSTOP)
         self._mark_fault()
 

@@ -4,8 +4,8 @@
 
 The service has TLS keys and default settings, among them the restart budget. A camera sends frames
 of 160x120 at 2 Hz. Once a minute, the measurements of a new keyframe become poison: the optimizer
-sends SIGKILL to its own process whenever it handles them. The exit code is 1 if a property is
-violated.
+sends SIGKILL to its own process whenever it handles them. The next message becomes poison only when
+the previous one is quarantined. The exit code is 1 if a property is violated.
 """
 
 import argparse
@@ -102,7 +102,7 @@ class PoisonRun:
     def __init__(self, folder: Path, scene: Sequence[CameraRgbd], settings: Sequence[str]) -> None:
         self.folder, self.result, self.recorder = folder, Result(), MessageRecorder()
         self.service = ServiceProcess(folder, self.recorder, (*settings,), has_defaults=True)
-        self.service.log = deque()  # Without a limit, because restarts are counted.
+        self.service.log = deque()  # It has no limit, because restarts are counted.
         self.camera = CameraStream(list(scene), RATE_HZ)
 
     def run(self, duration_s: float, every_s: float) -> Result:
@@ -113,6 +113,9 @@ class PoisonRun:
             self.camera.start(self.service.client)
             self.service.wait("a keyframe is in the graph", lambda: self.recorder.placed)
             self._stream(duration_s, every_s)
+            self.service.wait("the messages are quarantined", self._is_quarantined)
+            poison = max(self.result.deliveries, default=-1)
+            self.service.wait("a keyframe follows", lambda: max(self.recorder.keyframes) > poison)
             self.camera.stop()
             self.service.wait("all keyframes are handled", self._is_handled)
         except NotRecovered as error:
@@ -143,7 +146,7 @@ class PoisonRun:
                 if self.service.process.poll() is not None:
                     result.ends += 1
                     raise NotRecovered(f"the service ended:\n{self.service.tail()}")
-                if now_s >= started_s + next_s:
+                if now_s >= started_s + next_s and self._is_quarantined():
                     next_s += every_s
                     result.requested += 1
                     (self.folder / POISON).touch()
@@ -151,12 +154,17 @@ class PoisonRun:
             result.duration_s = now_s - started_s
         result.sent = self.camera.sent - first
 
-    def _is_handled(self) -> bool:
+    def _is_quarantined(self) -> bool:
+        """Return whether all requests found a keyframe, and these keyframes are quarantined."""
         self._count()
+        return len(self.result.deliveries) == self.result.requested == self.result.counted
+
+    def _is_handled(self) -> bool:
         result = self.result
         return (
-            len(result.deliveries) == result.requested == result.counted
+            self._is_quarantined()
             and result.keyframes - result.placed == result.deliveries.keys()
+            and max(result.placed) > max(result.deliveries, default=-1)
         )
 
     def _count(self) -> None:

@@ -92,8 +92,8 @@ class ServiceProcess:
     """Service that can be started again on the same state after a `kill`.
 
     Attributes:
-        ends: Times that the service ended although nobody had killed it, and was started again as
-            systemd does. This happens only with `has_defaults`.
+        ends: Times that the service ended without being killed, and was started again as systemd
+            does. This happens only with `has_defaults`.
         on_end: Function that starts the service again after such an end.
     """
 
