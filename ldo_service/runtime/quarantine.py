@@ -75,7 +75,7 @@ class Quarantine:
             suspects: Lock of this process for the handling of suspected messages.
         """
         self._folder, self._suspects = folder, suspects or asyncio.Lock()
-        self._deliveries: dict[bytes, int] = {}  # By digest; the last delivered message is last.
+        self._deliveries: dict[bytes, int] = {}  # The keys are digests; the last message is last.
         self._key, self.count = b"", 0  # Digest of the message that is being handled.
         if folder is not None:
             self._load()

@@ -147,8 +147,8 @@ class HealthCollector(Collector):
         self._silent_after_s = silent_after_s + COMES_BACK_S
         self._lock = Lock()
         self._last: dict[str, tuple[float, Health]] = {}  # Arrival and heartbeat, by actor.
-        # Time since which each actor has had queued messages and handled none, by actor. The time
-        # is that of the last heartbeat if the actor had none before, or has handled one since.
+        # Time since which each actor has had queued messages and handled none, by actor. If none
+        # was queued, or the actor has handled one since, it is the time of the last heartbeat.
         self._queued_since_s: dict[str, float] = {}
         self._begun_anew: dict[str, int] = {}  # Number of process restarts, by actor.
 
