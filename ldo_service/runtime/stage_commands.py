@@ -25,6 +25,7 @@ Commands:
 
 import asyncio
 import secrets
+from collections import defaultdict
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Literal
@@ -138,11 +139,15 @@ class CommandReceiver:
 
 
 class CommandSender:
-    """Client that a running service uses to send commands to the stages of its actors."""
+    """Client that a running service uses to send commands to the stages of its actors.
+
+    A stage gets the next command when it has replied to the last one, or when that has timed out.
+    """
 
     def __init__(self, transport: Transport) -> None:
         self._loop = asyncio.get_running_loop()
         self._reports: dict[int, asyncio.Future[str]] = {}
+        self._of_stage = defaultdict[str, asyncio.Lock](asyncio.Lock)  # Held for a command.
         self._number = (1 + secrets.randbits(30)) << COUNT_BITS  # Number of the last command.
         self._orders = transport.publisher(COMMAND_KEY)
         transport.subscribe(REPLY_KEY, self._arrived)
@@ -163,17 +168,21 @@ class CommandSender:
             An empty string on success, otherwise the error message. No reply within `timeout_s`
             counts as an error.
         """
-        self._number += 1
-        order = StageCommand(self._number, what, stage, *generation)
-        report = self._reports[order.number] = self._loop.create_future()
         try:
-            async with asyncio.timeout(timeout_s):
-                while not report.done():
-                    await self._orders.send(b"", encode_link(order))
-                    await asyncio.wait({report}, timeout=REPEAT_AFTER_S)
-                return report.result()
+            async with asyncio.timeout(timeout_s), self._of_stage[stage]:
+                self._number += 1
+                return await self._reply_to(StageCommand(self._number, what, stage, *generation))
         except TimeoutError:
             return f"did not answer within {timeout_s:.0f} s"
+
+    async def _reply_to(self, order: StageCommand) -> str:
+        """Send a command until the reply to it arrives, and return the error in the reply."""
+        report = self._reports[order.number] = self._loop.create_future()
+        try:
+            while not report.done():
+                await self._orders.send(b"", encode_link(order))
+                await asyncio.wait({report}, timeout=REPEAT_AFTER_S)
+            return report.result()
         finally:
             del self._reports[order.number]
 

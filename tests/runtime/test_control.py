@@ -388,3 +388,22 @@ async def test_reset_is_complete_when_the_empty_states_are_kept(
             generations.failures = 0
             assert (await scene.request("reset")).ok
             assert not marker.exists()
+
+
+async def test_actor_that_starts_during_a_command_executes_it_although_it_is_paused_too() -> None:
+    scene = Scene(actors=("source",))
+    control_ = Control(scene.transport, ("source",), ("source",), "here", 5.0)
+    scene.control = control_
+    async with running(scene.source):
+        assert (await scene.request("pause")).ok
+    saving = asyncio.create_task(scene.request("save"))
+    await asyncio.sleep(0.05)
+    assert not saving.done()
+    restarted = Stage(Source, scene.transport, config=QUICK)
+    async with running(restarted):
+        answer = await saving
+        assert answer.ok, answer.message
+        await eventually(lambda: restarted.health().paused)
+        assert (await scene.request("resume")).ok
+        assert not restarted.health().paused
+    control_.close()
