@@ -98,8 +98,8 @@ def serve(
         folder = state_folder(state, stack)
         if is_router and network.keys:
             network.keys.warn_of_expiry(OF_SERVICE)
-            private = stack.enter_context(temporary_folder())
-            network = replace(network, local_socket=str(local_socket or f"{private}/link"))
+            path = local_socket or stack.enter_context(temporary_folder()) / "link"
+            network = replace(network, local_socket=str(path))
         Service(
             settings,
             network,
@@ -186,7 +186,11 @@ def _usable_socket(path: Path, is_router_with_keys: bool) -> Path:
     if mode & OTHERS:
         raise ConfigError(
             f"--local-socket {path}: all users of this machine can access the folder "
-            f"{path.parent}, and the socket needs no keys. Run `chmod o= {path.parent}`, or choose "
-            "another folder."
+            f"{path.parent}, and the socket needs no keys. Choose another folder, such as one made "
+            f"by `mkdir -m 700 {path.parent / 'ldo'}`."
+        )
+    if path.exists() and not path.is_socket():
+        raise ConfigError(
+            f"--local-socket {path} exists and is no socket. Choose a path without a file."
         )
     return path

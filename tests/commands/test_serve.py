@@ -103,3 +103,15 @@ def test_local_socket_without_keys_or_router_is_rejected(
     with pytest.raises(ConfigError, match="opens its own router"):
         serve_at(tmp_path / "link", keys, client=True)
     assert not opened
+
+
+def test_local_socket_does_not_replace_a_file(
+    tmp_path: Path, keys: Path, opened: list[Endpoint]
+) -> None:
+    tmp_path.chmod(0o700)
+    file = tmp_path / "notes.txt"
+    file.write_text("kept")
+    with pytest.raises(ConfigError, match="exists and is no socket"):
+        serve_at(file, keys)
+    assert not opened
+    assert file.read_text() == "kept"
