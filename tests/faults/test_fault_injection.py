@@ -104,4 +104,4 @@ def test_table_has_a_row_for_each_kind() -> None:
     assert whole.startswith("| all | 2 |")
     assert whole.endswith("| 1 |")
     assert summary.startswith("compared to the bit: 5 maps, objects and graph after 0 restarts;")
-    assert summary.endswith("1 poses at most 1.0 cm off")
+    assert summary.endswith("1 poses at most 1.0 cm off; restart budget used up 0 times")

@@ -21,7 +21,7 @@ from ldo_service.transport.flow_control import Credit
 from . import two_hosts
 from .simulation import simulate
 
-SEEDS, SEEDS_PER_TEST = 200, 20
+SEEDS, SLOW_SEEDS, SEEDS_PER_TEST = 100, 100, 20
 # Seeds of which one has to show a fault of the runtime whose correction is taken out.
 SEARCHED_SEEDS = 60
 
@@ -33,7 +33,16 @@ def _without_log() -> Iterator[None]:
     logging.disable(logging.NOTSET)
 
 
-@pytest.mark.parametrize("first", range(0, SEEDS, SEEDS_PER_TEST))
+@pytest.mark.parametrize(
+    "first",
+    [
+        *range(0, SEEDS, SEEDS_PER_TEST),
+        *(
+            pytest.param(first, marks=pytest.mark.slow)
+            for first in range(SEEDS, SEEDS + SLOW_SEEDS, SEEDS_PER_TEST)
+        ),
+    ],
+)
 def test_no_fault_violates_an_invariant_or_stops_the_service_for_long(first: int) -> None:
     reports = [simulate(seed) for seed in range(first, first + SEEDS_PER_TEST)]
     assert [report for report in reports if report.violations] == []
