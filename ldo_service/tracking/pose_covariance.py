@@ -106,14 +106,16 @@ def inverse_of(covariance: np.ndarray) -> np.ndarray:
     """Return the information matrix [6, 6] of a pose, the inverse of its covariance.
 
     If color and depth of a frame contradict each other by an absurd amount, one variance is so
-    large that rounding makes the covariance singular. A small fraction of this variance is then
-    added to all directions.
+    large that the rounded covariance has no positive inverse. Its small variances are then raised
+    to a fraction of the large one. If it is not finite, the information is almost zero.
     """
-    try:
+    if not np.isfinite(covariance).all():
+        return ROUNDING * np.eye(len(covariance))
+    variances, directions = np.linalg.eigh(covariance)
+    least = ROUNDING * variances[-1]
+    if variances[0] >= least:
         return np.linalg.inv(covariance)
-    except np.linalg.LinAlgError:
-        added = ROUNDING * np.diag(covariance).max()
-        return np.linalg.inv(covariance + added * np.eye(len(covariance)))
+    return (directions / np.maximum(variances, least)) @ directions.T
 
 
 def contradiction(
