@@ -27,7 +27,7 @@ import asyncio
 import secrets
 from collections import defaultdict
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from typing import Literal
 
 import msgspec
@@ -142,6 +142,7 @@ class CommandSender:
     """Client that a running service uses to send commands to the stages of its actors.
 
     A stage gets the next command when it has replied to the last one, or when that has timed out.
+    Only `keep` does not wait, because a stage may be writing the previous generation for long.
     """
 
     def __init__(self, transport: Transport) -> None:
@@ -168,8 +169,9 @@ class CommandSender:
             An empty string on success, otherwise the error message. No reply within `timeout_s`
             counts as an error.
         """
+        turn = nullcontext() if what == "keep" else self._of_stage[stage]
         try:
-            async with asyncio.timeout(timeout_s), self._of_stage[stage]:
+            async with asyncio.timeout(timeout_s), turn:
                 self._number += 1
                 return await self._reply_to(StageCommand(self._number, what, stage, *generation))
         except TimeoutError:

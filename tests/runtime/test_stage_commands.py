@@ -127,13 +127,12 @@ async def test_pause_waits_for_the_current_step() -> None:
 async def test_busy_stage_keeps_its_state_once_for_all_waiting_commands() -> None:
     transport, seen, release = MemoryTransport(), [], Event()
     stage = collector(transport, seen, lambda _value: release.wait(60) and None, policy=Latest(1))
+    commander = CommandSender(transport)
     async with running(stage):
         transport.deliver(NUMBERS.name, encode_link(EXTERNAL_HEADER), encode_message(number(1)))
         await eventually(lambda: stage.health().state == "busy")
         answers = [
-            asyncio.create_task(
-                CommandSender(transport).order("keep", "collector", 60, (number, 0))
-            )
+            asyncio.create_task(commander.order("keep", "collector", 60, (number, 0)))
             for number in range(1, 6)
         ]
         await eventually(lambda: sum(answer.done() for answer in answers) == 4)
