@@ -108,7 +108,8 @@ def test_the_renderer_uses_the_threads_it_is_given(room: Sequence) -> None:
         whole_s, own_s = time.process_time() - whole_s, time.thread_time() - own_s
         return 1 - own_s / whole_s
 
-    assert helper_ratio(1) < 0.02  # Error of the clock, and threads that only wait.
+    # The error of the clock and threads that only wait take longer at some times.
+    assert min(helper_ratio(1) for _ in range(3)) == pytest.approx(0, abs=0.01)
     assert helper_ratio(8) > 0.02  # Independent of the speed of the threads.
 
 
