@@ -28,9 +28,7 @@ log = logging.getLogger(__name__)
 MAX_DELIVERIES = 3  # Deliveries after which a message that ended its process is not handled again.
 MAX_FILES = 20  # Messages that are kept on the disk; older ones are deleted.
 SUFFIX = ".message"
-MAX_SUSPECTS = (
-    8  # Messages whose deliveries are kept; those with the oldest deliveries are dropped.
-)
+MAX_SUSPECTS = 8  # Messages whose deliveries are counted; the oldest ones are dropped.
 _RECORD = struct.Struct("<16sII")  # Digest of the last message, its deliveries, all quarantined.
 _SUSPECT = struct.Struct("<16sI")  # Digest of an earlier message, its deliveries; 0 if unused.
 _CHECKSUM = struct.Struct("<I")  # CRC-32 of everything before it.
