@@ -12,6 +12,7 @@ from threading import Lock
 
 import msgspec
 
+from ldo_service import __version__
 from ldo_service.schemas import InputCount, decode
 from ldo_service.schemas.topics import Topic
 from ldo_service.transport.flow_control import (
@@ -83,6 +84,7 @@ class Mailbox:
         self.waits_for_disk = False
         self._orders: deque[StageCommand] = deque()
         self._grants: dict[str, Publisher] = {}
+        self._older: set[str] = set()  # Topics whose producer is of a version without nonces.
         self._inlets: dict[str, Inlet] = {}
         for port in ports:
             self._connect(port, transport, (past or {}).get(port.topic.name))
@@ -174,9 +176,12 @@ class Mailbox:
         with self._lock:
             if not self._connects:
                 return
-            nonce = welcome.nonces.get(self._consumer, 0)
+            nonce = (welcome.nonces or {}).get(self._consumer, 0)
             lost = 0 if start is None else inlet.welcome(welcome.epoch, start, nonce)
-            self._ask_for_grants()
+            if inlet.should_reply():
+                self._ask_for_grants()
+            if welcome.nonces is None and not inlet.is_connected:
+                self._warn_older_version(inlet.port.topic.name)
         if lost:
             log.error(
                 "%s: lost %d messages of %s, because the producer no longer has these messages. "
@@ -185,6 +190,17 @@ class Mailbox:
                 "supervision.evict_after_s or supervision.backlog_mb.",
                 self._consumer, lost, inlet.port.topic.name,
             )  # fmt: skip
+
+    def _warn_older_version(self, topic: str) -> None:
+        """Log once that a producer is of a version without nonces; the caller holds the lock."""
+        if topic not in self._older:
+            log.warning(
+                "%s: the actor that produces %s is of an older version and does not answer the "
+                "handshake of version %s. This input gets no messages from it. Update the program "
+                "that runs the actor (`ldo topics` names the actor), and restart it.",
+                self._consumer, topic, __version__,
+            )  # fmt: skip
+        self._older.add(topic)
 
     def _ask_for_grants(self) -> None:
         """Schedule `send_credits` on the event loop; the caller holds the lock."""
