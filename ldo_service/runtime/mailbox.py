@@ -32,6 +32,7 @@ from ldo_service.transport.interface import Publisher, Transport, call_soon
 from .actor import Backlog, In, Lossless
 from .inlet import Delivery, Inlet, LosslessInlet
 from .stage_commands import StageCommand
+from .supervision_policy import LOG_PERIOD_S, LogLimit
 
 log = logging.getLogger(__name__)
 
@@ -84,6 +85,7 @@ class Mailbox:
         self.waits_for_disk = False
         self._orders: deque[StageCommand] = deque()
         self._grants: dict[str, Publisher] = {}
+        self._malformed = LogLimit(LOG_PERIOD_S)
         self._older: set[str] = set()  # Topics whose producer is of a version without nonces.
         self._inlets: dict[str, Inlet] = {}
         for port in ports:
@@ -166,11 +168,12 @@ class Mailbox:
         try:
             welcome = decode(body, ProducerHello)
         except msgspec.DecodeError as error:
-            log.warning(
-                "%s: malformed handshake on %s ignored: %s. Do all programs on this network run "
-                "the same version?",
-                self._consumer, inlet.port.topic.name, error,
-            )  # fmt: skip
+            if self._malformed.is_due():
+                log.warning(
+                    "%s: malformed handshake on %s ignored: %s. Do all programs on this network "
+                    "run the same version?",
+                    self._consumer, inlet.port.topic.name, error,
+                )  # fmt: skip
             return
         start = welcome.starts.get(self._consumer)
         with self._lock:

@@ -5,9 +5,10 @@ import asyncio
 import pytest
 
 from ldo_service import __version__
-from ldo_service.runtime import In, Latest, Lossless
+from ldo_service.runtime import In, Latest, Lossless, Out
 from ldo_service.runtime.inlet import MAX_PROMPT_REPLIES, Delivery, LosslessInlet
 from ldo_service.runtime.mailbox import Mailbox
+from ldo_service.runtime.outlet import Outlet
 from ldo_service.schemas import encode as encode_message
 from ldo_service.schemas.message import LAST_INTEGER
 from ldo_service.transport.flow_control import (
@@ -296,3 +297,18 @@ def test_input_connects_to_an_earlier_epoch_whose_producer_answers_its_hello() -
         credit = inlet.grant("consumer")
         assert isinstance(credit, Credit)
         assert credit.epoch == epoch
+
+
+async def test_malformed_handshakes_and_credits_write_one_line_a_minute(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    transport = MemoryTransport()
+    mailbox = Mailbox("me", (In(NUMBERS, Lossless(2)),), transport)
+    outlet = Outlet(Out(DOUBLES), "me", 1, transport)
+    for _ in range(50):
+        transport.deliver(producer_hello_key(NUMBERS.name), b"", b"noise")
+        transport.deliver(credit_key(DOUBLES.name), b"", b"noise")
+    lines = [record.getMessage() for record in caplog.records]
+    assert [line.partition(":")[0] for line in lines] == ["me", DOUBLES.name]
+    mailbox.disconnect()
+    outlet.close()
