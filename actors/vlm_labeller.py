@@ -26,7 +26,7 @@ from ldo_service.detection.labellers import Labeller, ScoredLabel
 from ldo_service.detection.labellers.chat_completion import HttpConfig, HttpLabeller
 from ldo_service.detection.labellers.dual_encoder import DualEncoderConfig
 from ldo_service.detection.model_registry import open_labeller
-from ldo_service.detection.vocabulary import read_names
+from ldo_service.detection.vocabulary import canonical, read_names
 from ldo_service.errors import ConfigError, EndpointError, FrameError, ModelError
 from ldo_service.runtime import Actor, Backlog, In, Latest, Out
 from ldo_service.schemas import AddLabel, LabelNames, LabelRequest, LabelResult
@@ -147,7 +147,9 @@ class VlmLabeller(Actor):
             log.error("vlm_labeller: name %r not added: %s", message.name, refused)
         else:
             log.info("vlm_labeller: name %r added", message.name)
-            self._state = {"added": tuple(dict.fromkeys((*self._state["added"], message.name)))}
+            added = self._state["added"]
+            if canonical(message.name) not in map(canonical, added):
+                self._state = {"added": (*added, message.name)}
         names = self._labeller.names[:MAX_NAMES] if self._labeller else ()
         return LabelNames(stamp_ns=message.stamp_ns, names=names, error=refused)
 

@@ -86,10 +86,10 @@ class AddLabel(Message, frozen=True, kw_only=True):
     name: str  # Name to add, 1 to 100 characters.
 
     def check(self) -> None:
-        if not 0 < len(self.name.strip()) <= MAX_LABEL_LENGTH:
+        if not self.name.strip() or len(self.name) > MAX_LABEL_LENGTH:
             raise ValueError(
-                f"name has {len(self.name)} characters, must have 1 to {MAX_LABEL_LENGTH}, not "
-                "counting spaces at its ends"
+                f"name has {len(self.name)} characters, must have 1 to {MAX_LABEL_LENGTH}, and not "
+                "only spaces"
             )
 
 

@@ -15,7 +15,7 @@ from ldo_service.transport.flow_control import InletPosition, OutletPosition
 
 from .actor import Actor
 from .delivery_state import DeliveryState, LoggedInput, RestoredState, restore_actor
-from .supervision_policy import LogLimit
+from .supervision_policy import LOG_PERIOD_S, LogLimit
 
 log = logging.getLogger(__name__)
 
@@ -26,7 +26,6 @@ MAX_UNSYNCED_FILES = 100
 # generations. A service that completes them retires a few MB in between. More than 1 GB could fill
 # a small disk, such as an SD card of 32 GB.
 MAX_RETIRED_BYTES = 1_000_000_000
-LOG_PERIOD_S = 60.0  # Minimum time between two log lines about generations, seconds.
 
 
 class Checkpointer:

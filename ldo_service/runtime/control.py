@@ -31,9 +31,8 @@ from ldo_service.storage.atomic_write import sync, write_atomically
 from ldo_service.transport.interface import Transport
 
 from .generations import KEEP_WITHIN_S, GenerationKeeper
-from .restoring import LOG_PERIOD_S
 from .stage_commands import CommandSender, What
-from .supervision_policy import LogLimit
+from .supervision_policy import LOG_PERIOD_S, LogLimit
 
 log = logging.getLogger(__name__)
 

@@ -26,9 +26,8 @@ from ldo_service.storage.state_contents import StateContents, read_contents
 from ldo_service.storage.state_store import CONTENTS, GENERATION, NEWEST, FolderStore, list_name
 
 from .delivery_state import OFFSETS, OUTBOX, RestoredState
-from .restoring import LOG_PERIOD_S
 from .stage_commands import CommandSender
-from .supervision_policy import LogLimit
+from .supervision_policy import LOG_PERIOD_S, LogLimit
 
 log = logging.getLogger(__name__)
 

@@ -16,6 +16,11 @@ from ldo_service.transport.flow_control import (
 
 from .actor import Backlog, In, Latest, Lossless
 
+# Number of hellos of a producer in a row that an unconnected input replies to at once. The first
+# reply connects, unless a message is lost or arrives late. A producer that never answers, such as
+# one of an older version, replies to each reply.
+MAX_PROMPT_REPLIES = 3
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Delivery:
@@ -125,6 +130,7 @@ class LosslessInlet(Inlet):
     gap: bool = False  # A message is missing; the producer should retransmit.
     is_connected: bool = False  # The current producer has answered the hello of this input.
     nonce: int = field(default_factory=new_nonce)  # Number that the next answer must contain.
+    unanswered: int = 0  # Hellos of the producer since the last one that connected this input.
 
     @property
     def window(self) -> int:
@@ -166,6 +172,14 @@ class LosslessInlet(Inlet):
         self.gap = True  # Request the messages that were sent before the hello.
         return lost
 
+    def should_reply(self) -> bool:
+        """Return whether to reply at once to the hello that the producer has just sent.
+
+        If not, the input sends its own hello again with the next heartbeat.
+        """
+        self.unanswered = 0 if self.is_connected else self.unanswered + 1
+        return self.unanswered <= MAX_PROMPT_REPLIES
+
     def accept(self, header: Header) -> bool:
         """Return whether the message is the next one and fits into the window.
 
@@ -189,7 +203,7 @@ class LosslessInlet(Inlet):
         super().reset()
         self.epoch = self.handled = self.arrived = 0
         self.gap = self.is_connected = False
-        self.nonce = new_nonce()
+        self.nonce, self.unanswered = new_nonce(), 0
 
     def _overflow(self, newest: Delivery) -> list[Delivery]:  # noqa: ARG002
         return []  # `accept` enforces the window.

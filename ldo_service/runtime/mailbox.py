@@ -12,6 +12,7 @@ from threading import Lock
 
 import msgspec
 
+from ldo_service import __version__
 from ldo_service.schemas import InputCount, decode
 from ldo_service.schemas.topics import Topic
 from ldo_service.transport.flow_control import (
@@ -31,6 +32,7 @@ from ldo_service.transport.interface import Publisher, Transport, call_soon
 from .actor import Backlog, In, Lossless
 from .inlet import Delivery, Inlet, LosslessInlet
 from .stage_commands import StageCommand
+from .supervision_policy import LOG_PERIOD_S, LogLimit
 
 log = logging.getLogger(__name__)
 
@@ -83,6 +85,8 @@ class Mailbox:
         self.waits_for_disk = False
         self._orders: deque[StageCommand] = deque()
         self._grants: dict[str, Publisher] = {}
+        self._malformed = LogLimit(LOG_PERIOD_S)
+        self._older: set[str] = set()  # Topics whose producer is of a version without nonces.
         self._inlets: dict[str, Inlet] = {}
         for port in ports:
             self._connect(port, transport, (past or {}).get(port.topic.name))
@@ -164,19 +168,23 @@ class Mailbox:
         try:
             welcome = decode(body, ProducerHello)
         except msgspec.DecodeError as error:
-            log.warning(
-                "%s: malformed handshake on %s ignored: %s. Do all programs on this network run "
-                "the same version?",
-                self._consumer, inlet.port.topic.name, error,
-            )  # fmt: skip
+            if self._malformed.is_due():
+                log.warning(
+                    "%s: malformed handshake on %s ignored: %s. Do all programs on this network "
+                    "run the same version?",
+                    self._consumer, inlet.port.topic.name, error,
+                )  # fmt: skip
             return
         start = welcome.starts.get(self._consumer)
         with self._lock:
             if not self._connects:
                 return
-            nonce = welcome.nonces.get(self._consumer, 0)
+            nonce = (welcome.nonces or {}).get(self._consumer, 0)
             lost = 0 if start is None else inlet.welcome(welcome.epoch, start, nonce)
-            self._ask_for_grants()
+            if inlet.should_reply():
+                self._ask_for_grants()
+            if welcome.nonces is None and not inlet.is_connected:
+                self._warn_older_version(inlet.port.topic.name)
         if lost:
             log.error(
                 "%s: lost %d messages of %s, because the producer no longer has these messages. "
@@ -185,6 +193,17 @@ class Mailbox:
                 "supervision.evict_after_s or supervision.backlog_mb.",
                 self._consumer, lost, inlet.port.topic.name,
             )  # fmt: skip
+
+    def _warn_older_version(self, topic: str) -> None:
+        """Log once that a producer is of a version without nonces; the caller holds the lock."""
+        if topic not in self._older:
+            log.warning(
+                "%s: the actor that produces %s is of an older version and does not answer the "
+                "handshake of version %s. This input gets no messages from it. Update the program "
+                "that runs the actor (`ldo topics` names the actor), and restart it.",
+                self._consumer, topic, __version__,
+            )  # fmt: skip
+        self._older.add(topic)
 
     def _ask_for_grants(self) -> None:
         """Schedule `send_credits` on the event loop; the caller holds the lock."""

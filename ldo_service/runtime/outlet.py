@@ -29,6 +29,7 @@ from .actor import Out
 from .consumers import Consumer, Consumers
 from .last_value import LastValue
 from .outbox import Outbox
+from .supervision_policy import LOG_PERIOD_S, LogLimit
 
 log = logging.getLogger(__name__)
 
@@ -97,6 +98,7 @@ class Outlet:
         self._backlogs: dict[str, Publisher] = {}
         self._pushing: dict[str, asyncio.Task[None]] = {}
         self._closed, self._last_value = False, LastValue()
+        self._malformed = LogLimit(LOG_PERIOD_S)
         self.sent = self.waited = self.repeated = self.evicted = 0
         self._open(transport)
 
@@ -214,11 +216,9 @@ class Outlet:
         try:
             request = decode_request(body)
         except msgspec.DecodeError as error:
-            log.warning(
-                "%s: malformed credit message ignored: %s. Do all programs on this network run the "
-                "same version?",
-                self.topic.name, error,
-            )  # fmt: skip
+            if self._malformed.is_due():
+                log.warning("%s: malformed credit message ignored: %s. Do all programs on this "
+                            "network run the same version?", self.topic.name, error)  # fmt: skip
             return
         call_soon(self._loop, self._take_request, request)
 

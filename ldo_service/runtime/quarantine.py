@@ -129,7 +129,7 @@ class Quarantine:
         )
         try:
             write_atomically(path, msgspec.msgpack.encode(message))
-            self._remove_oldest()
+            self._remove_oldest(path)
             where = f"It is saved as {path}"
         except OSError as error:
             where = f"It cannot be saved: {error}"
@@ -196,10 +196,11 @@ class Quarantine:
             finally:
                 os.close(descriptor)
 
-    def _remove_oldest(self) -> None:
-        assert self._folder is not None
-        files = sorted(self._folder.glob(f"*{SUFFIX}"), key=lambda file: file.stat().st_mtime_ns)
-        for file in files[:-MAX_FILES]:
+    def _remove_oldest(self, newest: Path) -> None:
+        """Remove the oldest files, but not the newest, whose time may be wrong like the clock."""
+        others = [file for file in newest.parent.glob(f"*{SUFFIX}") if file != newest]
+        others.sort(key=lambda file: file.stat().st_mtime_ns)
+        for file in others[: -(MAX_FILES - 1)]:
             file.unlink(missing_ok=True)
 
 

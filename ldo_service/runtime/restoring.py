@@ -12,11 +12,9 @@ from .actor import Actor
 from .checkpointer import Checkpointer
 from .journal import Journal
 from .stage_metrics import StageMetrics
-from .supervision_policy import LogLimit, RestartBudget, SupervisionConfig
+from .supervision_policy import LOG_PERIOD_S, LogLimit, RestartBudget, SupervisionConfig
 
 log = logging.getLogger(__name__)
-
-LOG_PERIOD_S = 60.0  # Minimum time between two log lines about failed messages, seconds.
 
 
 class ActorRestorer:

@@ -37,7 +37,7 @@ class StageMetrics:
     step_ms: deque[float] = field(default_factory=lambda: deque(maxlen=200))
     last_step_ms: float = 0.0  # Duration of the last step, ms.
     last_stamp_ns: int = 0  # Stamp of the last handled message.
-    finished_at_s: float = field(default_factory=monotonic_s)  # End of the last step.
+    finished_at_s: float = field(default_factory=monotonic_s)  # End of the last step or its save.
     started_at_s: float | None = None  # Start of the current step; None between steps.
     facts: dict[str, float] = field(
         default_factory=dict
@@ -54,6 +54,8 @@ class StageMetrics:
             yield
             self.last_step_ms = 1e3 * (self.clock.now_s() - started_s)
         finally:
+            # The stage saves the state after this, and must not look stalled meanwhile.
+            self.finished_at_s = monotonic_s()
             self.started_at_s = None
             if self.heartbeat is not None:
                 self.heartbeat.end()

@@ -18,10 +18,9 @@ from .inlet import Delivery
 from .journal import Journal
 from .mailbox import Mailbox
 from .outlets import Outlets
-from .restoring import LOG_PERIOD_S
 from .stage_commands import StageCommand
 from .stage_metrics import StageMetrics
-from .supervision_policy import LogLimit
+from .supervision_policy import LOG_PERIOD_S, LogLimit
 
 log = logging.getLogger(__name__)
 

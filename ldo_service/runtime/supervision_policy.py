@@ -68,6 +68,10 @@ class RestartBudget:
         return min(self._delay_s * 2.0 ** min(recent - 1, 60), self._delay_max_s)
 
 
+# Minimum time between two log lines of one kind that messages or a bad disk can cause, seconds.
+LOG_PERIOD_S = 60.0
+
+
 class LogLimit:
     """Rate limit for a log line that messages from outside can cause: one line per period.
 

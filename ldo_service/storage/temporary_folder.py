@@ -4,6 +4,11 @@ A process that is killed cannot remove its temporary folders. Each folder is the
 it is in use, and the operating system releases the lock when the process ends. Whenever a process
 makes such a folder, it first removes the folders that no process has locked any more. The lock also
 keeps systemd-tmpfiles from removing the files of a service that runs for many days.
+
+Several machines may share the folder of temporary files over a network, where one machine may not
+see the locks of another. The name of a folder therefore contains a part of the boot id of its
+machine, and a process removes only folders with the boot id of its own machine. It also removes
+nothing on a file system that ignores locks.
 """
 
 import fcntl
@@ -16,6 +21,8 @@ from pathlib import Path
 
 # Prefix of the folders in the temporary folder; other folders there must not have it.
 PREFIX = "ldo-tmp-"
+# File with a random number of the running kernel, which differs between machines.
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 
 @contextmanager
@@ -41,9 +48,11 @@ def make_temporary_folder() -> tuple[Path, int]:
     Raises:
         OSError: The folder cannot be created.
     """
-    _remove_unused()
+    boot_id = _boot_id()
+    if boot_id:
+        _remove_unused(boot_id)
     while True:
-        path = Path(tempfile.mkdtemp(prefix=PREFIX))
+        path = Path(tempfile.mkdtemp(prefix=f"{PREFIX}{boot_id}-"))
         with suppress(FileNotFoundError):  # Another process removed it before it was locked.
             lock = _open(path)
             with suppress(OSError):  # A network file system may not lock folders.
@@ -64,14 +73,34 @@ def _open(path: Path) -> int:
     return os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
 
 
-def _remove_unused() -> None:
-    """Remove the folders of this user that no process has locked."""
-    for path in Path(tempfile.gettempdir()).glob(f"{PREFIX}*"):
+def _boot_id() -> str:
+    """Return the start of the boot id of this machine; empty if the system has none."""
+    try:
+        return BOOT_ID.read_text()[:8]
+    except OSError:
+        return ""
+
+
+def _remove_unused(boot_id: str) -> None:
+    """Remove the folders of this user and machine that no process has locked."""
+    for path in Path(tempfile.gettempdir()).glob(f"{PREFIX}{boot_id}-*"):
         with suppress(OSError):  # The folder belongs to another user, or is in use.
             lock = _open(path)
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                if os.fstat(lock).st_uid == os.geteuid():
+                if os.fstat(lock).st_uid == os.geteuid() and _is_locked(path):
                     shutil.rmtree(path, ignore_errors=True)
             finally:
                 os.close(lock)
+
+
+def _is_locked(path: Path) -> bool:
+    """Return whether a folder is locked; False for a locked folder if locks have no effect."""
+    descriptor = _open(path)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False

@@ -108,7 +108,8 @@ class ProducerHello(msgspec.Struct, frozen=True, array_like=True):
 
     epoch: int  # Epoch of the producer.
     starts: dict[str, int]  # Offset of the first message for each known consumer, by name.
-    nonces: dict[str, int] = msgspec.field(default_factory=dict)  # Last nonce of each consumer.
+    # Last nonce of each consumer; None: the producer is of a version without nonces.
+    nonces: dict[str, int] | None = None
 
     def __post_init__(self) -> None:
         if self.epoch <= 0:

@@ -10,7 +10,7 @@ from ldo_service.schemas import Message
 from ldo_service.schemas.topics import FROM_ODOMETRY, FROM_OPERATORS, FROM_OUTSIDE
 
 from .endpoint import Endpoint
-from .flow_control import Header, encode_link
+from .flow_control import Header, encode_link, new_epoch
 
 
 class MessageSender:
@@ -22,7 +22,7 @@ class MessageSender:
 
     def __init__(self, session: zenoh.Session, network: Endpoint) -> None:
         self._session, self._network = session, network
-        self._epoch = time.time_ns()
+        self._epoch = new_epoch()
         self._publishers: dict[type[Message], Any] = {}  # Publisher by message type.
 
     def send(self, message: Message, source: str, number: int) -> None:

@@ -104,6 +104,18 @@ class FakeLabeller:
         return {"names": len(self.names)}
 
 
+def test_spellings_of_one_name_are_saved_once(pair: Path, names: Path) -> None:
+    actor = VlmLabeller(VlmLabellerConfig(model=str(pair), names=str(names)))
+    for name in ("Blue", "blue", " BLUE ", "bLUE"):
+        assert add_name(actor, name).error == ""
+    assert actor.snapshot() == {"added": ("Blue",)}
+
+
+def test_name_of_too_many_characters_is_rejected_although_most_are_spaces() -> None:
+    with pytest.raises(ValueError, match="name has 101 characters"):
+        AddLabel(stamp_ns=1, name="blue" + 97 * " ")
+
+
 # --- answers --------------------------------------------------------------------------------------
 def test_a_region_gets_its_name(pair: Path, names: Path) -> None:
     actor = VlmLabeller(VlmLabellerConfig(model=str(pair), names=str(names)))
@@ -210,10 +222,11 @@ def test_only_a_valid_server_answer_labels_the_region(
     tmp_path: Path, behaves, facts: dict[str, float]
 ) -> None:
     (tmp_path / "names.txt").write_text("cup\nvase\n")
-    quick = HttpClientConfig(timeout_s=0.2, attempts=1, per_minute=1e9)
+    timeout_s = 0.2 if behaves is hangs else 30.0
+    endpoint = HttpClientConfig(timeout_s=timeout_s, patience_s=30.0, attempts=1, per_minute=1e9)
     with serving(behaves) as server:
         config = VlmLabellerConfig(
-            url=server.url, names=str(tmp_path / "names.txt"), http=HttpConfig(endpoint=quick)
+            url=server.url, names=str(tmp_path / "names.txt"), http=HttpConfig(endpoint=endpoint)
         )
         actor = VlmLabeller(config)
         answer = only_result(actor.handle(request()))

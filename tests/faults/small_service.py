@@ -32,6 +32,7 @@ from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage
 from ldo_service.runtime.stage_commands import CommandSender
 from ldo_service.runtime.supervision import wait_until_quiet
+from ldo_service.schemas import Health
 from ldo_service.schemas.topics import CAMERA_RGBD
 from ldo_service.storage.state_store import FolderStore
 from ldo_service.transport.interface import MemoryTransport
@@ -71,8 +72,10 @@ class SmallService:
 
     def __init__(self, folder: Path, *, syncs: bool = False) -> None:
         """Create the stages, which restore their states; `open_service` runs them."""
-        transport = MemoryTransport()
-        parameters = actor_parameters(CONFIG.with_map_folder(folder / "map"))
+        transport = self.transport = MemoryTransport()
+        offload = partial(OffloadConfig, reach_m=1.5, chunk_edge_m=0.9)
+        with patch("ldo_service.config.parameters.OffloadConfig", offload):
+            parameters = actor_parameters(CONFIG.with_map_folder(folder / "map"))
         self.stages: list[Stage] = []
         for box in finish_order(GRAPH):
             assert box.make is not None
@@ -92,15 +95,18 @@ class SmallService:
         self._room = open_sequence("synthetic:room")
         self._tasks: Sequence[asyncio.Task[None]] = ()
 
+    def health(self, actor: str) -> Health:
+        """Return the health message of an actor."""
+        (stage,) = (stage for stage in self.stages if stage.name == actor)
+        return stage.health()
+
     def metric(self, actor: str, name: str) -> float:
         """Return a metric in the health message of an actor; 0 if it has none."""
-        (stage,) = (stage for stage in self.stages if stage.name == actor)
-        return stage.health().metrics.get(name, 0.0)
+        return self.health(actor).metrics.get(name, 0.0)
 
     def state_of(self, actor: str) -> str:
         """Return the state in the health message of an actor."""
-        (stage,) = (stage for stage in self.stages if stage.name == actor)
-        return stage.health().state
+        return self.health(actor).state
 
     async def send_frame(self, index: int) -> None:
         """Send a frame of the room, and wait until the tracker has handled it."""
@@ -109,8 +115,7 @@ class SmallService:
         await eventually(lambda: self._frames() > before)
 
     def _frames(self) -> int:
-        (tracker,) = (stage for stage in self.stages if stage.name == "tracker")
-        inputs = tracker.health().inputs  # Empty until the tracker is ready.
+        inputs = self.health("tracker").inputs  # Empty until the tracker is ready.
         return next((i.delivered for i in inputs if i.topic == "frame/rgbd"), 0)
 
     async def wait_until_quiet(self) -> None:
@@ -127,10 +132,8 @@ class SmallService:
 @asynccontextmanager
 async def open_service(folder: Path, *, syncs: bool = False) -> AsyncIterator[SmallService]:
     """Run a service until the block ends; without `SmallService.stop`, it is cancelled."""
-    offload = partial(OffloadConfig, reach_m=1.5, chunk_edge_m=0.9)
-    with patch("ldo_service.config.parameters.OffloadConfig", offload):
-        service = SmallService(folder, syncs=syncs)
-        async with running(*service.stages) as tasks:
-            service._tasks = tasks
-            await eventually(lambda: all(service.state_of(a) == "ready" for a in ACTORS))
-            yield service
+    service = SmallService(folder, syncs=syncs)
+    async with running(*service.stages) as tasks:
+        service._tasks = tasks
+        await eventually(lambda: all(service.state_of(a) == "ready" for a in ACTORS))
+        yield service

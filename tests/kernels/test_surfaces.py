@@ -1,5 +1,8 @@
 """Comparison of the surfaces of two views, with NumPy and with finite differences."""
 
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -195,3 +198,18 @@ def test_features_of_wrong_shapes_are_rejected() -> None:
     outputs = np.empty((200, 2)), np.empty((200, 2, 6)), np.empty((200, 2))
     with pytest.raises(ValueError, match="moved must have shape"):
         _surfaces.reproject(np.ones((200, 3)), pixels, T, INTRINSICS, *outputs)
+
+
+# Program for one instruction set, which runs the comparisons with NumPy of this file.
+COMPARE_ALL = f"""
+sys.path.insert(0, {str(Path(__file__).parents[2])!r})
+from tests.kernels import test_surfaces as test
+test.test_surfaces_equal_those_of_numpy()
+test.test_comparison_equals_that_of_numpy(1)
+test.test_comparison_of_features_equals_that_of_numpy()
+test.test_reprojection_equals_that_of_numpy()
+"""
+
+
+def test_each_instruction_set_gives_the_results_of_numpy(with_isa: Callable) -> None:
+    with_isa(COMPARE_ALL, {})

@@ -1,10 +1,14 @@
 """Tests of the mailbox: inputs of policy Latest and messages of other programs."""
 
+import asyncio
+
 import pytest
 
-from ldo_service.runtime import In, Latest, Lossless
-from ldo_service.runtime.inlet import Delivery, LosslessInlet
+from ldo_service import __version__
+from ldo_service.runtime import In, Latest, Lossless, Out
+from ldo_service.runtime.inlet import MAX_PROMPT_REPLIES, Delivery, LosslessInlet
 from ldo_service.runtime.mailbox import Mailbox
+from ldo_service.runtime.outlet import Outlet
 from ldo_service.schemas import encode as encode_message
 from ldo_service.schemas.message import LAST_INTEGER
 from ldo_service.transport.flow_control import (
@@ -28,9 +32,10 @@ class Feed:
 
     def __init__(self, transport: MemoryTransport, topic: str = NUMBERS.name) -> None:
         self._transport, self._topic, self._seq = transport, topic, 0
+        self.epoch = 1
 
     def send(self, value: int, key: str = "") -> None:
-        header = Header("feed", 1, self._seq, value, key)
+        header = Header("feed", self.epoch, self._seq, value, key)
         self._seq += 1
         body = encode_message(number(value, region=key))
         self._transport.deliver(self._topic, encode_link(header), body)
@@ -136,6 +141,40 @@ async def test_flooded_lossless_input_queues_only_its_window() -> None:
     (counted,) = mailbox.counts()
     assert (counted.queued, counted.peak_queued) == (3, 3)
     assert await take_all(mailbox) == [("", 0), ("", 1), ("", 2)]
+
+
+async def test_producer_without_nonces_is_named_once_and_is_not_asked_without_pause(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    transport, hellos = MemoryTransport(), 0
+    answer = encode_link([1, {"me": 0}])  # A hello of the version before nonces.
+
+    def reply(_header: bytes, body: memoryview) -> None:
+        nonlocal hellos
+        if isinstance(decode_request(body), ConsumerHello):
+            hellos += 1
+            transport.deliver(producer_hello_key(NUMBERS.name), b"", answer)
+
+    transport.subscribe(credit_key(NUMBERS.name), reply)
+    mailbox = Mailbox("me", (In(NUMBERS, Lossless(3)),), transport)
+    for _ in range(100):
+        await asyncio.sleep(0)
+    assert hellos == 1 + MAX_PROMPT_REPLIES
+    for _ in range(5):  # Heartbeats.
+        mailbox.send_credits()
+        for _ in range(10):
+            await asyncio.sleep(0)
+    assert hellos == 6 + MAX_PROMPT_REPLIES
+    (warning,) = [record.getMessage() for record in caplog.records]
+    assert "the actor that produces test/number is of an older version" in warning
+    assert f"version {__version__}" in warning
+    nonce = mailbox._inlets[NUMBERS.name].nonce  # type: ignore[attr-defined]
+    answer = encode_link(ProducerHello(2, {"me": 0}, {"me": nonce}))  # It is updated.
+    transport.deliver(producer_hello_key(NUMBERS.name), b"", answer)
+    feed = Feed(transport)
+    feed.epoch = 2
+    feed.send(5)
+    assert await take_all(mailbox) == [("", 5)]
 
 
 async def test_undecodable_body_is_rejected_and_the_next_is_handled() -> None:
@@ -258,3 +297,18 @@ def test_input_connects_to_an_earlier_epoch_whose_producer_answers_its_hello() -
         credit = inlet.grant("consumer")
         assert isinstance(credit, Credit)
         assert credit.epoch == epoch
+
+
+async def test_malformed_handshakes_and_credits_write_one_line_a_minute(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    transport = MemoryTransport()
+    mailbox = Mailbox("me", (In(NUMBERS, Lossless(2)),), transport)
+    outlet = Outlet(Out(DOUBLES), "me", 1, transport)
+    for _ in range(50):
+        transport.deliver(producer_hello_key(NUMBERS.name), b"", b"noise")
+        transport.deliver(credit_key(DOUBLES.name), b"", b"noise")
+    lines = [record.getMessage() for record in caplog.records]
+    assert [line.partition(":")[0] for line in lines] == ["me", DOUBLES.name]
+    mailbox.disconnect()
+    outlet.close()

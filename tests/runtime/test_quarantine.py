@@ -1,6 +1,7 @@
 """Tests of messages that end the process of their actor."""
 
 import asyncio
+import os
 import struct
 import sys
 import zlib
@@ -199,3 +200,15 @@ async def test_folder_keeps_the_newest_messages_and_the_full_count(tmp_path: Pat
         assert quarantine.add("collector", delivery(seq)) == seq + 1
     assert len(list(tmp_path.glob("*.message"))) == MAX_FILES
     assert Quarantine(tmp_path).count == MAX_FILES + 5
+
+
+async def test_newest_message_is_kept_although_the_clock_was_set_back(tmp_path: Path) -> None:
+    quarantine = Quarantine(tmp_path)
+    for seq in range(MAX_FILES):
+        quarantine.add("collector", delivery(seq))
+    for path in tmp_path.glob("*.message"):
+        os.utime(path, (1e10, 1e10))  # Times in the future, as after the clock was set back.
+    quarantine.add("collector", delivery(MAX_FILES))
+    names = {path.name for path in tmp_path.glob("*.message")}
+    assert len(names) == MAX_FILES
+    assert f"test.number-1-{MAX_FILES}.message" in names

@@ -2,11 +2,13 @@
 
 import asyncio
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from itertools import count
 from pathlib import Path
 from threading import Event
 from typing import Any
 
+import msgspec
 import pytest
 
 from ldo_service.errors import ConfigError, DamagedStateError, RestartsExhausted, StageStalled
@@ -16,10 +18,11 @@ from ldo_service.runtime.stage import Stage, SupervisionConfig, new_epoch
 from ldo_service.runtime.stage_metrics import StageMetrics
 from ldo_service.runtime.supervision_policy import RunningClock
 from ldo_service.schemas import Health, Message, decode
-from ldo_service.service.diagnostics import ActorStatus, diagnose
+from ldo_service.service.diagnostics import ActorStatus, diagnose, find_stall
 from ldo_service.storage.memory_store import MemoryStore
 from ldo_service.storage.state_store import FolderStore, State
 from ldo_service.transport.interface import MemoryTransport
+from tests.schemas.examples import EXAMPLES
 
 from .fake_actors import (
     DOUBLES,
@@ -303,6 +306,29 @@ async def test_time_without_running_does_not_count_as_a_hanging_step() -> None:
             now_s += 1.0
             metrics.clock.tick(0.5)
         assert metrics.busy_s == pytest.approx(31.0)
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_long_step_of_a_back_end_is_no_stall_while_its_state_is_saved(
+    monkeypatch: pytest.MonkeyPatch, fails: bool
+) -> None:
+    now_s = 0.0
+    monkeypatch.setattr("ldo_service.runtime.stage_metrics.monotonic_s", lambda: now_s)
+    metrics = StageMetrics(state="ready", finished_at_s=0.0)
+    inputs = (msgspec.structs.replace(EXAMPLES["health"].inputs[0], queued=3),)
+
+    def stall() -> object:
+        fields = {"actor": "optimizer", "epoch": 1, "paused": False, "outputs": ()}
+        return find_stall(metrics.health(inputs=inputs, **fields))
+
+    with suppress(ValueError), metrics.step():
+        now_s = 60.0
+        if fails:
+            raise ValueError
+    now_s = 61.0  # The state is being saved, so the step is not recorded yet.
+    assert stall() is None
+    now_s = 70.0
+    assert "took none of 3 queued messages for 10 s" in str(stall())
 
 
 async def test_time_without_running_does_not_evict_a_consumer(

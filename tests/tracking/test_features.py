@@ -1,10 +1,19 @@
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
-from ldo_service.tracking import PyramidConfig, pyramid_of
+from ldo_service.tracking import (
+    Odometry,
+    OdometryConfig,
+    PyramidConfig,
+    TrackingStatus,
+    features,
+    pyramid_of,
+)
 from ldo_service.tracking.features import (
     FeatureConfig,
     detect,
@@ -12,6 +21,7 @@ from ldo_service.tracking.features import (
     estimate_pose,
     match,
 )
+from ldo_service.tracking.pyramid import Pyramid
 
 CONFIG = FeatureConfig()
 T_REFERENCE_CAMERA = se3.exp(np.array([0.05, -0.2, 0.05, 0.2, 0.1, 0.15]))  # 12 degrees and 27 cm.
@@ -39,6 +49,39 @@ def test_feature_points_project_to_their_pixels(large_room) -> None:
     np.testing.assert_allclose(
         large_room.camera.project(features.points_camera), features.pixels, atol=1e-6
     )
+
+
+def test_features_are_detected_once_per_image_and_settings(large_room) -> None:
+    view = pyramid_of(large_room.view(np.eye(4)), PyramidConfig())
+    same = pyramid_of(large_room.view(np.eye(4)), PyramidConfig())
+    features, fewer = detect(view, CONFIG), detect(view, replace(CONFIG, count=50))
+    assert detect(view, FeatureConfig()) is features
+    assert len(fewer.pixels) <= 50 < len(features.pixels)
+    assert detect(same, CONFIG) is not features
+    np.testing.assert_array_equal(detect(same, CONFIG).descriptors, features.descriptors)
+
+
+def test_tracker_detects_the_features_of_an_image_once_also_when_it_becomes_the_reference(
+    large_room, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    detected: list[tuple[int, FeatureConfig]] = []
+    original, views = features._detected, []
+
+    def count(view: Pyramid, config: FeatureConfig) -> features.Features:
+        views.append(view)  # Keeps the view, so that its id stays unique.
+        detected.append((id(view), config))
+        return original(view, config)
+
+    monkeypatch.setattr(features, "_detected", count)
+    odometry = Odometry(OdometryConfig(features=CONFIG))
+    steps = [np.array([0.0, 0.25 * (k // 2), 0.0, 0.0, 0.0, 0.0]) for k in range(8)]
+    results = [
+        odometry.process(large_room.view(se3.exp(step), index=k)) for k, step in enumerate(steps)
+    ]
+    assert {result.status for result in results} == {TrackingStatus.OK}
+    assert len(set(detected)) == len(detected)
+    assert sum(config == CONFIG for _, config in detected) > 3
+    assert len({image for image, config in detected if config == CONFIG}) < len(steps)
 
 
 def test_sift_matches_agree_with_opencv(large_room) -> None:

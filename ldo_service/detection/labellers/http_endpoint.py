@@ -5,6 +5,7 @@ import os
 import ssl
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import httpx2
@@ -180,7 +181,9 @@ class HttpClient:
         """
         self.attempts += 1
         try:
-            return asyncio.run(self._exchange(path, body, within_s))
+            with asyncio.Runner() as runner:
+                runner.get_loop().set_default_executor(_Resolver())
+                return runner.run(self._exchange(path, body, within_s))
         except TimeoutError as error:
             raise _TransientError(f"did not answer within {within_s:.1f} s") from error
         except httpx2.TransportError as error:
@@ -219,6 +222,18 @@ class HttpClient:
                 "model and the API key."
             )
         return answer
+
+
+class _Resolver(ThreadPoolExecutor):
+    """Thread that looks up the addresses of a host name.
+
+    The lookup has no timeout of its own. The event loop therefore does not wait for a lookup that
+    continues after the timeout of the attempt.
+    """
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:  # noqa: ARG002
+        """Let a running lookup end in the background."""
+        super().shutdown(wait=False, cancel_futures=cancel_futures)
 
 
 class _TransientError(Exception):

@@ -272,6 +272,25 @@ def test_silent_addresses_of_a_server_share_one_timeout(monkeypatch: pytest.Monk
         assert time.monotonic() - start_s < 4, "six timeouts one after the other take 6 s"
 
 
+def test_lookup_of_a_host_name_takes_no_longer_than_the_timeout(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    is_over = threading.Event()
+
+    def look_up(*_args: object, **_kwargs: object) -> None:
+        assert is_over.wait(60)
+        raise socket.gaierror
+
+    monkeypatch.setattr(socket, "getaddrinfo", look_up)
+    client = labeller("http://silent-dns:80/v1", views=1, endpoint={"timeout_s": 0.2})
+    try:
+        with pytest.raises(EndpointError, match=r"did not answer within 0\.2 s"):
+            client.label([RED])
+        assert not is_over.is_set(), "the three attempts ended before the lookups did"
+    finally:
+        is_over.set()
+
+
 def test_unresponsive_address_falls_back_to_the_next_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
