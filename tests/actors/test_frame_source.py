@@ -21,6 +21,7 @@ from ldo_service.schemas import (
     FrameRgbd,
     Image,
     Message,
+    decode,
     encode,
 )
 
@@ -318,6 +319,20 @@ def test_unpaired_images_are_bounded_by_bytes(monkeypatch: pytest.MonkeyPatch) -
     for number in range(8):
         stamp_ns = number * 10**9
         list(source.handle(CameraColor(stamp_ns=stamp_ns, frame=0, camera=camera, image=image)))
+    assert source.metrics()["color_unpaired"] == 5
+
+
+def test_unknown_fields_count_for_the_size_of_unpaired_images(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("ldo_service.actors.frame_source.PAIR_BUFFER_BYTES", 50_000)
+    source = FrameSource()
+    camera = CameraModel(width=100, height=50, fx=100.0, fy=100.0, cx=50.0, cy=25.0)
+    image = Image(encoding="png", width=100, height=50, data=memoryview(b"x"))
+    for number in range(8):
+        half = CameraColor(stamp_ns=number * 10**9, frame=0, camera=camera, image=image)
+        fields = msgspec.msgpack.decode(encode(half)) | {"unknown": bytes(15_000)}
+        list(source.handle(decode(msgspec.msgpack.encode(fields), CameraColor)))
     assert source.metrics()["color_unpaired"] == 5
 
 
