@@ -6,8 +6,9 @@
 The generators know physics: cameras, poses, depths and stamps lie at, near and beyond each bound.
 The roles are camera, odometry and operator. The stages are the frame source, the tracker, the
 mapper and the labeller, which `Control` pauses, resumes, saves and resets. The program prints
-inputs per second. Its exit code is 1 if a stage ends, a step or a heartbeat fails, or the queued
-messages of all stages exceed 256 MB.
+inputs per second, and each failure with its traceback, seed and input. Its exit code is 1 if a
+stage ends, a step or a heartbeat fails, or the queued messages of all stages exceed 256 MB. With
+`python -W error`, a NumPy warning about an invalid number is a failure too.
 """
 
 import argparse
@@ -39,6 +40,7 @@ from ldo_service.geometry import codecs
 from ldo_service.runtime import Actor
 from ldo_service.runtime.actor_graph import lossless_consumers
 from ldo_service.runtime.control import Control
+from ldo_service.runtime.restoring import FailureLog
 from ldo_service.runtime.stage import Stage
 from ldo_service.runtime.supervision_policy import SupervisionConfig
 from ldo_service.schemas import ControlAnswer, decode
@@ -281,6 +283,26 @@ MAPPER = MapperConfig(
 )
 
 
+class EveryFailure(FailureLog):
+    """Log of failed steps without a limit of lines per minute."""
+
+    def step_failed(self, name: str, what: str, *, is_of_message: bool) -> None:  # noqa: ARG002
+        super().step_failed(name, what, is_of_message=False)
+
+
+class FailurePrinter(logging.Handler):
+    """Log handler that prints each exception with the seed and the input that it followed."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__()
+        self._seed, self.inputs = seed, 0
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.exc_info:
+            where = f"seed {self._seed}, input {self.inputs}"
+            print(f"{where}: {self.format(record)}", file=sys.stderr, flush=True)
+
+
 class Service:
     """The stages with inputs from outside, and their `Control`, in one event loop."""
 
@@ -304,6 +326,8 @@ class Service:
             )
             for actor, make in makers.items()
         ]
+        for stage in self.stages:
+            stage._failure_log = EveryFailure()
         names = [stage.name for stage in self.stages]
         self.tasks = [asyncio.create_task(s.run(), name=s.name) for s in self.stages]
         self._control = Control(transport, names, names[:1], "memory", timeout_s=30.0)
@@ -423,9 +447,11 @@ def main() -> int:
     until.add_argument("--minutes", type=float)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    logging.disable()
+    printer = FailurePrinter(arguments.seed)
+    logging.getLogger().addHandler(printer)
 
     def is_over(inputs: int, seconds: float) -> bool:
+        printer.inputs = inputs
         if arguments.minutes is not None:
             return seconds >= 60 * arguments.minutes
         return inputs >= arguments.inputs
@@ -435,6 +461,8 @@ def main() -> int:
     except RuntimeError as error:
         print(f"hostile input: {error}", file=sys.stderr)
         return 1
+    finally:
+        logging.getLogger().removeHandler(printer)
     print(*(f"{name}={value:.6g}" for name, value in asdict(outcome).items()))
     rate = outcome.inputs / outcome.seconds
     print(f"{rate:.0f} inputs/s; 10^6 take {1e6 / rate / 60:.0f} min")

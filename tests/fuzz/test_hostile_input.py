@@ -3,6 +3,7 @@
 import asyncio
 import logging
 import random
+import re
 import sys
 from collections.abc import Iterator
 
@@ -68,9 +69,15 @@ def test_program_fails_if_a_heartbeat_fails(monkeypatch: pytest.MonkeyPatch) -> 
     assert exit_code(monkeypatch) == 1
 
 
-def test_program_fails_if_a_message_becomes_a_dead_letter(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_program_prints_the_traceback_of_each_failed_message_with_seed_and_input(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     def fail(*_: object) -> None:
         raise ValueError("cannot be handled")
 
     monkeypatch.setattr(Tracker, "_track", fail)
+    logging.disable(logging.NOTSET)
     assert exit_code(monkeypatch) == 1
+    printed = capsys.readouterr().err
+    assert printed.count("ValueError: cannot be handled") >= 2  # A message is tried twice.
+    assert re.search(r"^seed 0, input [1-9]", printed, re.MULTILINE)
