@@ -5,10 +5,12 @@
 
 The generators know physics: cameras, poses, depths and stamps lie at, near and beyond each bound.
 The roles are camera, odometry and operator. The stages are the frame source, the tracker, the
-mapper and the labeller, which `Control` pauses, resumes, saves and resets. The program prints
-inputs per second, and each failure with its traceback, seed and input. Its exit code is 1 if a
-stage ends, a step or a heartbeat fails, or the queued messages of all stages exceed 256 MB. With
-`python -W error`, a NumPy warning about an invalid number is a failure too.
+mapper, the loop closer, the optimizer and the labeller. `Control` pauses, resumes, saves and resets
+them.
+
+The program prints inputs per second, and each failure with its traceback, seed and input. Its exit
+code is 1 if a stage ends, a step or a heartbeat fails, or the queued messages of all stages exceed
+256 MB. If Python runs with `-W error`, a warning of NumPy about an invalid number is a failure too.
 """
 
 import argparse
@@ -30,8 +32,10 @@ import msgspec
 import numpy as np
 
 from ldo_service.actors.frame_source import FrameSource
+from ldo_service.actors.loop_closer import LoopCloser
 from ldo_service.actors.mapper import Mapper
 from ldo_service.actors.mapper_config import MapperConfig
+from ldo_service.actors.optimizer import Optimizer
 from ldo_service.actors.tracker import Tracker
 from ldo_service.actors.vlm_labeller import VlmLabeller
 from ldo_service.detection.labellers.chat_completion import HttpLabeller
@@ -312,6 +316,8 @@ class Service:
             Tracker: Tracker,
             VlmLabeller: lambda: VlmLabeller(labeller=labeller()),
             Mapper: lambda: Mapper(MAPPER),
+            LoopCloser: LoopCloser,
+            Optimizer: Optimizer,
         }
         config = SupervisionConfig(heartbeat_s=0.05)
         self.stages = [
