@@ -292,6 +292,18 @@ def test_depth_beyond_any_camera_counts_as_not_measured(
     assert source.metrics()["pixels_too_far"] == depth_m[:10].size
 
 
+@pytest.mark.parametrize("near", [1e-45, 1e-36, 0.0009])
+def test_depth_below_a_millimeter_counts_as_not_measured(
+    room: Sequence, message: CameraRgbd, near: float
+) -> None:
+    depth_m = room[3].depth_m.copy()
+    depth_m[:10], depth_m[10:20] = near, 0.001
+    sent = msgspec.structs.replace(message, depth=Image.raw("f32", depth_m), depth_scale=1.0)
+    (frame,) = FrameSource().handle(sent)
+    assert not frame.depth_m.numpy()[:10].any()
+    np.testing.assert_array_equal(frame.depth_m.numpy()[10:], depth_m[10:])
+
+
 def test_cameras_that_do_not_belong_together_are_rejected_at_once() -> None:
     width, height = 640, 480
     lens = (1e9, 0.0, 0.0, 0.0, 0.0, 1e12, 0.0, 0.0)
