@@ -38,8 +38,8 @@ Input = CameraRgbd | CameraColor | CameraDepth
 # Number of unpaired images before the warning: a second of frames, longer than a start-up effect.
 UNPAIRED_WARNING_COUNT = 30
 MAX_RESTART_LINES = 10  # Number of camera restarts after which they are only counted.
-# Maximum size of the images of a stream that wait for their partner, bytes: ten raw color images of
-# 1080p.
+# Maximum size of the messages of both streams that wait for their partner, bytes: ten raw color
+# images of 1080p, or the two images of the largest frame.
 PAIR_BUFFER_BYTES = 64_000_000
 
 
@@ -187,7 +187,7 @@ class FrameSource(Actor):
         return StreamPairer(
             round(self.config.max_skew_s * 1e9),
             self.config.pair_buffer,
-            size_of=lambda half: half.image.data.nbytes,
+            size_of=_message_bytes,
             max_bytes=PAIR_BUFFER_BYTES,
         )
 
@@ -243,6 +243,15 @@ class FrameSource(Actor):
             "skew_ms_p50": float(np.median(skews_ms)),  # Median over the recent pairs.
             "skew_ms_max": max(skews_ms),
         }
+
+
+def _message_bytes(half: CameraColor | CameraDepth) -> int:
+    """Return the size of the memory that a message keeps in use, bytes.
+
+    The image data is a view of the received message, so the whole message stays in memory. This
+    includes fields that this version does not know.
+    """
+    return memoryview(half.image.data.obj).nbytes
 
 
 def join_halves(color: CameraColor, depth: CameraDepth) -> RawFrame:

@@ -45,8 +45,8 @@ class CameraModel(msgspec.Struct, frozen=True, kw_only=True):
 
 
 # rgb8, bgr8: color, 3 bytes per pixel. jpeg: color. png: color of 8 bits, or depth of 16 bits.
-# z16: depth, little-endian uint16. f32: depth, little-endian float32; NaN, infinity and 1000 m or
-# more mean "not measured". +zstd: the same, compressed.
+# z16: depth, little-endian uint16. f32: depth, little-endian float32; NaN, infinity, less than 1 mm
+# and 1000 m or more mean "not measured". +zstd: the same, compressed.
 ImageEncoding = Literal["rgb8", "bgr8", "jpeg", "png", "z16", "z16+zstd", "f32", "f32+zstd"]
 BYTES_PER_PIXEL: dict[str, int] = {"rgb8": 3, "bgr8": 3, "z16": 2, "f32": 4}
 

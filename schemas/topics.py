@@ -21,6 +21,9 @@ from ldo_service.schemas.odometry import OdometryPrior
 from ldo_service.schemas.pose import TrackedPose
 
 ROBOT_PREFIX = "ldo"
+# Maximum size of a message without images that other programs publish, bytes. The largest one, a
+# name with spaces around it, has some hundred bytes.
+SMALL_MESSAGE_BYTES = 65_536
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +39,8 @@ class Topic:
     key: str | None = None
     answer: type[Message] | None = None  # Type of the reply if `message` is the payload of a query.
     is_per_actor: bool = False  # True if each actor publishes on its own key, `<name>/<actor>`.
+    # Maximum size of a message, bytes; None: only the limit of all messages applies.
+    max_bytes: int | None = None
 
     @property
     def subscription_key(self) -> str:
@@ -51,7 +56,10 @@ CAMERA_RGBD = Topic("camera/rgbd", CameraRgbd, "RGB-D frame of the camera")
 CAMERA_COLOR = Topic("camera/color", CameraColor, "color image of a camera with two topics")
 CAMERA_DEPTH = Topic("camera/depth", CameraDepth, "depth image, paired with color by stamp")
 ODOMETRY_PRIOR = Topic(
-    "odometry/prior", OdometryPrior, "pose of the robot's base from another odometry"
+    "odometry/prior",
+    OdometryPrior,
+    "pose of the robot's base from another odometry",
+    max_bytes=SMALL_MESSAGE_BYTES,
 )
 FRAME_RGBD = Topic("frame/rgbd", FrameRgbd, "rectified frame, depth in meters")
 POSE_TRACKED = Topic("pose/tracked", TrackedPose, "camera pose of each frame", is_state=True)
@@ -69,14 +77,24 @@ LABEL_REQUEST = Topic(
     "label/request", LabelRequest, "image crops of a region that needs a label", key="region"
 )
 LABEL_RESULT = Topic("label/result", LabelResult, "label of a requested region", key="region")
-LABEL_ADD = Topic("label/add", AddLabel, "request to add a name to the labeller's list")
+LABEL_ADD = Topic(
+    "label/add",
+    AddLabel,
+    "request to add a name to the labeller's list",
+    max_bytes=SMALL_MESSAGE_BYTES,
+)
 LABEL_NAMES = Topic(
     "label/names", LabelNames, "names that the labeller chooses from", is_state=True
 )
 MAP_VIEW = Topic("map/view", MapRendering, "map rendered at the newest keyframe")
 MAP_DELTA = Topic("map/delta", MapDelta, "changes of the map since the last version")
 MAP_SNAPSHOT = Topic("map/snapshot", MapSnapshot, "whole map, in parts", is_state=True)
-MAP_REFINE = Topic("map/refine", RefineMap, "request for more iterations on the map")
+MAP_REFINE = Topic(
+    "map/refine",
+    RefineMap,
+    "request for more iterations on the map",
+    max_bytes=SMALL_MESSAGE_BYTES,
+)
 GRAPH_CORRECTION = Topic("graph/correction", GraphCorrection, "all keyframe poses", is_state=True)
 HEALTH = Topic(
     "health", Health, "counters and latency of an actor (health/<actor>)", is_per_actor=True

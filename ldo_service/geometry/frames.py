@@ -17,6 +17,9 @@ from .camera import Camera
 # Depth from which on a value means "not measured", meters. Depth cameras measure up to 100 m. Some
 # simulators write their far plane, 1e30 or the largest float where they measured nothing.
 MAX_DEPTH_M = 1000.0
+# Depth below which a value means "not measured", meters. It is the smallest depth of an image in
+# millimeters. The inverse of a much smaller depth, multiplied by a focal length, has no float32.
+MIN_DEPTH_M = 0.001
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +70,8 @@ class RawFrame:
     index: int  # Running number of the frame in its source.
     stamp_ns: int  # Time of the exposure.
     color: np.ndarray  # [H, W, 3] uint8 RGB.
-    # [H, W] uint16, float32 or float64, z in 1/depth_scale meters; 0, negative, NaN or at least
-    # MAX_DEPTH_M where not measured.
+    # [H, W] uint16, float32 or float64, z in 1/depth_scale meters; NaN, below MIN_DEPTH_M or at
+    # least MAX_DEPTH_M where not measured.
     depth: np.ndarray
     depth_scale: float  # Units of `depth` per meter.
     camera: Camera  # Intrinsics with lens distortion.
@@ -125,11 +128,11 @@ def in_meters(depth: np.ndarray, depth_scale: float) -> np.ndarray:
         depth_scale: Units of `depth` per meter.
 
     Returns:
-        [H, W] float32; 0 where the depth is not positive or not below `MAX_DEPTH_M`.
+        [H, W] float32; 0 where the depth is below `MIN_DEPTH_M` or not below `MAX_DEPTH_M`.
     """
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         depth_m = depth.astype(np.float32) / np.float32(depth_scale)
-        depth_m[~((depth_m > 0) & (depth_m < MAX_DEPTH_M))] = 0.0
+        depth_m[~((depth_m >= np.float32(MIN_DEPTH_M)) & (depth_m < MAX_DEPTH_M))] = 0.0
     return depth_m
 
 

@@ -120,8 +120,9 @@ class StreamPairer(Generic[A, B]):
         max_skew_ns: Largest difference between the stamps of a pair, nanoseconds.
         buffer: Largest number of measurements of a stream that wait for a partner.
         size_of: Function that returns the size of a measurement in bytes.
-        max_bytes: Largest total size in bytes of the waiting measurements of a stream. The newest
-            measurement may wait alone whatever its size.
+        max_bytes: Largest total size in bytes of the waiting measurements of both streams. Beyond
+            it, the oldest measurement of the larger stream is dropped. A single measurement may
+            wait whatever its size.
 
     Raises:
         ConfigError: An argument is out of range.
@@ -172,6 +173,11 @@ class StreamPairer(Generic[A, B]):
         """Number of measurements of the second stream that were dropped without a partner."""
         return self._b.lost
 
+    @property
+    def waiting_bytes(self) -> int:
+        """Size of the measurements of both streams that wait for a partner, bytes."""
+        return self._bytes_of(self._a) + self._bytes_of(self._b)
+
     def skews_ms(self) -> list[float]:
         """Return the absolute stamp differences of the last 200 pairs, in milliseconds."""
         return [skew * 1e-6 for skew in self._skews_ns]
@@ -185,19 +191,19 @@ class StreamPairer(Generic[A, B]):
             if skew > self._max_skew_ns or self._has_nearer(earlier, later, skew):
                 earlier.lose()
             elif self._may_get_nearer(earlier, skew) and len(later.waiting) <= self._buffer:
-                return
+                break
             else:
                 self.pairs += 1
                 self._skews_ns.append(skew)
                 yield a.popleft(), b.popleft()  # type: ignore[misc]
         for half in (self._a, self._b):
-            while len(half.waiting) > self._buffer or self._is_too_large(half):
+            while len(half.waiting) > self._buffer:
                 half.lose()
+        while len(a) + len(b) > 1 and self.waiting_bytes > self._max_bytes:
+            max(self._a, self._b, key=self._bytes_of).lose()
 
-    def _is_too_large(self, half: StreamBuffer) -> bool:
-        if len(half.waiting) < 2:
-            return False
-        return sum(map(self._size_of, half.waiting)) > self._max_bytes
+    def _bytes_of(self, stream: StreamBuffer) -> int:
+        return sum(map(self._size_of, list(stream.waiting)))
 
     @staticmethod
     def _has_nearer(earlier: StreamBuffer, later: StreamBuffer, skew: int) -> bool:

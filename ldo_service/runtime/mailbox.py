@@ -36,9 +36,10 @@ from .supervision_policy import LOG_PERIOD_S, LogLimit
 
 log = logging.getLogger(__name__)
 
-# Maximum size in bytes of all queued messages of inputs with policy `Latest` in one mailbox: two of
-# the largest messages. A burst of four raw frames of 1080p has 33 MB.
-MAX_WAITING_BYTES = 128_000_000
+# Maximum size in bytes of all queued messages of inputs with policy `Latest` in one mailbox: one of
+# the largest messages. A burst of four raw frames of 1080p has 41 MB. A single message may be
+# larger, if `max_bytes` allows it.
+MAX_WAITING_BYTES = 64_000_000
 
 
 class Mailbox:
@@ -126,13 +127,23 @@ class Mailbox:
                 inlet.paused += 1
             elif header is None:
                 self._reject(inlet, "malformed header")
-            elif body.nbytes > self._max_bytes and not isinstance(inlet, LosslessInlet):
-                limit = "service.max_decoded_message_mb"
-                self._reject(inlet, f"its {body.nbytes} bytes exceed {limit}")
+            elif excess := self._excess(inlet, body.nbytes):
+                self._reject(inlet, excess)
             elif inlet.accept(header):
                 self._store(inlet, Delivery(inlet.port, header, body))
             else:
                 self._ask_for_grants()
+
+    def _excess(self, inlet: Inlet, size_bytes: int) -> str:
+        """Return why a message is too large for its input, or an empty string if it is not."""
+        if isinstance(inlet, LosslessInlet):
+            return ""
+        limit = inlet.port.topic.max_bytes
+        if limit is not None and size_bytes > limit:
+            return f"its {size_bytes} bytes exceed the {limit} bytes of this topic"
+        if size_bytes > self._max_bytes:
+            return f"its {size_bytes} bytes exceed service.max_decoded_message_mb"
+        return ""
 
     def _reject(self, inlet: Inlet, why: str) -> None:
         """Count and log a message that is rejected before it is decoded.
@@ -157,10 +168,13 @@ class Mailbox:
     def _bound_bytes(self) -> None:
         """Drop the oldest message of the largest queue until the queues fit into the limit.
 
-        The caller holds the lock.
+        A single message may wait whatever its size. The caller holds the lock.
         """
         latest = [i for i in self._inlets.values() if not isinstance(i, LosslessInlet)]
-        while sum(inlet.waiting_bytes for inlet in latest) > MAX_WAITING_BYTES:
+        while (
+            sum(len(inlet.waiting) for inlet in latest) > 1
+            and sum(inlet.waiting_bytes for inlet in latest) > MAX_WAITING_BYTES
+        ):
             largest = max(latest, key=lambda inlet: inlet.waiting_bytes)
             self._order.remove(largest.drop_oldest())
 

@@ -21,6 +21,7 @@ from ldo_service.schemas import (
     FrameRgbd,
     Image,
     Message,
+    decode,
     encode,
 )
 
@@ -291,6 +292,18 @@ def test_depth_beyond_any_camera_counts_as_not_measured(
     assert source.metrics()["pixels_too_far"] == depth_m[:10].size
 
 
+@pytest.mark.parametrize("near", [1e-45, 1e-36, 0.0009])
+def test_depth_below_a_millimeter_counts_as_not_measured(
+    room: Sequence, message: CameraRgbd, near: float
+) -> None:
+    depth_m = room[3].depth_m.copy()
+    depth_m[:10], depth_m[10:20] = near, 0.001
+    sent = msgspec.structs.replace(message, depth=Image.raw("f32", depth_m), depth_scale=1.0)
+    (frame,) = FrameSource().handle(sent)
+    assert not frame.depth_m.numpy()[:10].any()
+    np.testing.assert_array_equal(frame.depth_m.numpy()[10:], depth_m[10:])
+
+
 def test_cameras_that_do_not_belong_together_are_rejected_at_once() -> None:
     width, height = 640, 480
     lens = (1e9, 0.0, 0.0, 0.0, 0.0, 1e12, 0.0, 0.0)
@@ -318,6 +331,20 @@ def test_unpaired_images_are_bounded_by_bytes(monkeypatch: pytest.MonkeyPatch) -
     for number in range(8):
         stamp_ns = number * 10**9
         list(source.handle(CameraColor(stamp_ns=stamp_ns, frame=0, camera=camera, image=image)))
+    assert source.metrics()["color_unpaired"] == 5
+
+
+def test_unknown_fields_count_for_the_size_of_unpaired_images(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("ldo_service.actors.frame_source.PAIR_BUFFER_BYTES", 50_000)
+    source = FrameSource()
+    camera = CameraModel(width=100, height=50, fx=100.0, fy=100.0, cx=50.0, cy=25.0)
+    image = Image(encoding="png", width=100, height=50, data=memoryview(b"x"))
+    for number in range(8):
+        half = CameraColor(stamp_ns=number * 10**9, frame=0, camera=camera, image=image)
+        fields = msgspec.msgpack.decode(encode(half)) | {"unknown": bytes(15_000)}
+        list(source.handle(decode(msgspec.msgpack.encode(fields), CameraColor)))
     assert source.metrics()["color_unpaired"] == 5
 
 

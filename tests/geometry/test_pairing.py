@@ -143,3 +143,10 @@ def test_jitter_below_half_a_period_gives_the_pairs_of_associate(jitter) -> None
     paired = feed(pairs, *events)
     assert paired == [(a[i], b[j]) for i, j in expected][: len(paired)]
     assert len(paired) >= len(expected) - 1, "only the last may still wait for a nearer one"
+
+
+def test_both_streams_together_are_bounded_by_bytes_and_the_larger_one_gives_way() -> None:
+    # The next measurement of a may be nearer to those of b, so both streams wait.
+    pairs = StreamPairer[Half, Half](15 * MS, 8, size_of=lambda _half: 30, max_bytes=64)
+    assert feed(pairs, ("a", 0), ("a", 20), ("b", 32), ("b", 33), ("b", 34)) == []
+    assert (pairs.waiting_bytes, pairs.lost_a, pairs.lost_b) == (60, 1, 2)

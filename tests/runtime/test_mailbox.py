@@ -11,6 +11,7 @@ from ldo_service.runtime.mailbox import Mailbox
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.schemas import encode as encode_message
 from ldo_service.schemas.message import LAST_INTEGER
+from ldo_service.schemas.topics import LABEL_ADD, MAP_REFINE, ODOMETRY_PRIOR, Topic
 from ldo_service.transport.flow_control import (
     ConsumerHello,
     Credit,
@@ -269,6 +270,30 @@ async def test_queued_messages_are_bounded_by_bytes_and_the_largest_input_gives_
     assert (numbers.queued, numbers.dropped) == (2, 48)
     assert (doubles.queued, doubles.dropped) == (1, 0)
     assert len(mailbox._order) == 3
+    mailbox.disconnect()
+
+
+async def test_single_message_may_exceed_the_limit_of_queued_bytes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("ldo_service.runtime.mailbox.MAX_WAITING_BYTES", 10_000)
+    transport = MemoryTransport()
+    mailbox = Mailbox("me", (In(NUMBERS, Latest(64)), In(DOUBLES, Latest(64))), transport)
+    for _ in range(3):
+        transport.deliver(NUMBERS.name, b"", bytes(20_000))
+    numbers, _ = mailbox.counts()
+    assert (numbers.queued, numbers.dropped) == (1, 2)
+    mailbox.disconnect()
+
+
+@pytest.mark.parametrize("topic", [ODOMETRY_PRIOR, LABEL_ADD, MAP_REFINE])
+async def test_message_larger_than_its_topic_allows_is_rejected(topic: Topic) -> None:
+    transport = MemoryTransport()
+    mailbox = Mailbox("me", (In(topic, Latest(64)),), transport)
+    transport.deliver(topic.name, b"", bytes(65_536))
+    transport.deliver(topic.name, b"", bytes(65_537))
+    (counted,) = mailbox.counts()
+    assert (counted.queued, counted.rejected) == (1, 1)
     mailbox.disconnect()
 
 
