@@ -75,7 +75,7 @@ def test_keyframe_and_iteration_transfer_only_what_changed(
     assert downloads == [4 * n, *[touched * ROW_BYTES] * 3]  # Step counts, then rows and moments.
     backend.begin(gaussians)
     backend.end()
-    assert arrays.taken() == ([], [4 * n])  # Nothing has changed since the last plan.
+    assert arrays.taken() == ([], [4 * n])  # The map is as it was after the last plan.
     gaussians.rows[[3, 7, 9], 0] += 1
     backend.begin(gaussians)
     assert arrays.taken() == ([4 * 3, ROW_BYTES * 3], [])  # Indices, then rows.
