@@ -13,8 +13,9 @@ ROOT = Path(__file__).parent.parent
 # layer, so there is no import cycle between packages. `ldo_service` itself contains the version.
 LAYERS = (
     ("errors", "ldo_service"),
+    ("storage",),
     ("schemas", "kernels", "demo_networks"),
-    ("geometry", "storage"),
+    ("geometry",),
     ("calibration", "detection", "gaussians", "pose_graph", "synthetic", "cameras", "transport"),
     ("datasets", "volumes", "regions", "tracking", "runtime", "client"),
     ("semantics", "recordings"),

@@ -25,12 +25,14 @@ from ldo_service.runs.networks import require_usable_networks
 
 from .options import (
     ConfigFile,
+    Device,
     HoldOutEvery,
     MaxFrames,
     Preset,
     Settings,
     Stride,
     argument,
+    with_device,
     with_preset,
 )
 from .run import with_options
@@ -86,6 +88,7 @@ def batch(
             help="threads for each recording, and with --cluster the CPUs reserved for it",
         ),
     ] = 1,
+    device: Device = None,
     memory_gb: Annotated[
         float, argument(metavar="GB", help="memory that is reserved for each recording")
     ] = MEMORY_GB,
@@ -135,6 +138,7 @@ def batch(
         refine_iterations,
         export,
         threads,
+        device,
     )
     _require_positive(
         workers=workers, threads=threads, memory_gb=memory_gb, max_staged_gb=max_staged_gb
@@ -164,9 +168,11 @@ def _plan(
     refine: int,
     exports: tuple[ExportFormat, ...],
     threads: int,
+    device: str | None,
 ) -> RunPlan:
     """Check that the networks can be used, and return the plan of the work on each recording."""
     loaded = with_options(load_config(config, settings), hold_out_every, threads)
+    loaded = with_device(loaded, device)
     require_usable_networks(loaded)
     return RunPlan(
         config=loaded,

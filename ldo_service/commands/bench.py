@@ -1,6 +1,7 @@
 """Command `ldo bench`: measure the speed of the Gaussian optimizer, or of the mapper."""
 
 import json
+import os
 import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from ldo_service.datasets import open_sequence
 from ldo_service.errors import ConfigError, DeviceError
 from ldo_service.evaluation.iteration import Iteration, bench_camera, iteration_times
 from ldo_service.geometry import Camera
+from ldo_service.kernels.gpu.benchmark_result import BenchmarkResult, result_file, save_result
 from ldo_service.kernels.gpu.device import MIN_CAPABILITY, Gpu, find_gpu
 from ldo_service.runs.map_benchmark import HeldOutErrors, MapMeasurement, TrackedSource
 
@@ -38,7 +40,14 @@ class BenchRender:
     gaussians: Annotated[int, argument(help="Gaussians in view")] = 100_000
     gaussians_out_of_view: Annotated[int, argument(help="additional Gaussians out of view")] = 0
     size: Annotated[str, argument(metavar="WxH", help="size of the image, pixels")] = "640x480"
-    threads: Annotated[int, argument(help="threads of the kernels")] = 1
+    threads: Annotated[
+        int | None,
+        argument(
+            metavar="T",
+            help="threads of the kernels; default: 1, or with --device cuda all cores of the CPU, "
+            "as in the mapper",
+        ),
+    ] = None
     repeats: Annotated[int, argument(help="iterations; the times are medians over them")] = 20
     json_: Json = False
 
@@ -103,7 +112,9 @@ def bench(
     Set the environment variable LDO_ISA to avx512, avx2 or baseline to choose the instruction set.
     With --device cuda, the command first compares the results of the GPU with those of the CPU. If
     they differ, it measures nothing. If they agree, `ldo bench render` measures an iteration of the
-    optimizer and the alignment of a frame on both devices.
+    optimizer and the alignment of a frame on both devices. It saves the result in the user's cache
+    folder (LDO_CACHE). With service.device=auto, mapper and tracker use the device that was faster
+    in the last saved result.
 
       ldo bench
       ldo bench --device cuda
@@ -123,9 +134,11 @@ def bench_render(verb: BenchRender, device: str = "cpu") -> None:
         DeviceError: The device is cuda, but no GPU is available, or its results are wrong.
     """
     width, height = _pixels(verb.size)
-    if not min(verb.gaussians, verb.threads, verb.repeats) >= 1:
+    cores = os.cpu_count() or 1
+    threads = (cores if device == "cuda" else 1) if verb.threads is None else verb.threads
+    if not min(verb.gaussians, threads, verb.repeats) >= 1:
         raise ConfigError(
-            f"--gaussians {verb.gaussians}, --threads {verb.threads} and --repeats {verb.repeats} "
+            f"--gaussians {verb.gaussians}, --threads {threads} and --repeats {verb.repeats} "
             "must each be at least 1."
         )
     if verb.gaussians_out_of_view < 0:
@@ -134,10 +147,10 @@ def bench_render(verb: BenchRender, device: str = "cpu") -> None:
         )
     camera = bench_camera(width, height)
     if device == "cuda":
-        bench_gpu_render(verb, camera)
+        bench_gpu_render(verb, camera, threads)
         return
     iteration = Iteration(
-        verb.gaussians, camera, threads=verb.threads, elsewhere=verb.gaussians_out_of_view
+        verb.gaussians, camera, threads=threads, elsewhere=verb.gaussians_out_of_view
     )
     times = asdict(iteration_times(iteration, verb.repeats))
     facts = {
@@ -146,7 +159,7 @@ def bench_render(verb: BenchRender, device: str = "cpu") -> None:
         "gaussians_out_of_view": verb.gaussians_out_of_view,
         "width": width,
         "height": height,
-        "threads": verb.threads,
+        "threads": threads,
     }
     if verb.json_:
         print(json.dumps(times | facts))
@@ -156,11 +169,13 @@ def bench_render(verb: BenchRender, device: str = "cpu") -> None:
         console.print(_table(times))
 
 
-def bench_gpu_render(verb: BenchRender, camera: Camera) -> None:
-    """Measure one iteration on a GPU and on the CPU, and print the times side by side.
+def bench_gpu_render(verb: BenchRender, camera: Camera, threads: int) -> None:
+    """Measure one iteration on a GPU and on the CPU, print the times side by side, and save them.
+
+    A failure of the GPU is saved too, so that an earlier result does not select this GPU.
 
     Raises:
-        ConfigError: An option applies to the CPU alone.
+        ConfigError: An option applies to the CPU alone, or the result cannot be saved.
         DeviceError: There is no GPU, or its results are wrong.
     """
     if verb.gaussians_out_of_view:
@@ -169,7 +184,17 @@ def bench_gpu_render(verb: BenchRender, camera: Camera) -> None:
     # This module imports Triton, which is optional.
     from ldo_service.evaluation.device_iteration import device_times
 
-    times = device_times(gpu.arrays, verb.gaussians, camera, verb.repeats, threads=verb.threads)
+    result = BenchmarkResult(
+        gpu=gpu.name,
+        versions=gpu.versions_and_ours,
+        scene=f"{camera.width}x{camera.height} pixels, {verb.gaussians} Gaussians, {threads} "
+        "threads of the CPU",
+    )
+    try:
+        times = device_times(gpu.arrays, verb.gaussians, camera, verb.repeats, threads=threads)
+    except DeviceError as error:
+        save_result(msgspec.structs.replace(result, error=str(error)))
+        raise
     facts = {
         "isa": kernels.isa(),
         "gpu": gpu.name,
@@ -177,19 +202,26 @@ def bench_gpu_render(verb: BenchRender, camera: Camera) -> None:
         "gaussians": verb.gaussians,
         "width": camera.width,
         "height": camera.height,
-        "threads": verb.threads,
+        "threads": threads,
         "gpu_mb": times.gpu_mb,
     }
     if verb.json_:
         print(json.dumps(asdict(times) | facts))
-        return
+    else:
+        _print_both(times.cpu_ms, times.gpu_ms, facts)
+    save_result(msgspec.structs.replace(result, cpu_ms=times.cpu_ms, gpu_ms=times.gpu_ms))
+    if not verb.json_:
+        print(f"saved in {result_file()}; service.device=auto chooses the faster device")
+
+
+def _print_both(cpu_ms: dict[str, float], gpu_ms: dict[str, float], facts: dict[str, Any]) -> None:
     console = Console(highlight=False)
     console.print("render: " + ", ".join(f"{name} {fact}" for name, fact in facts.items()))
     columns = [Column(name, justify="right") for name in ("CPU ms", "GPU ms", "CPU / GPU")]
     table = Table("step", *columns)
-    for name, gpu_ms in times.gpu_ms.items():
-        cpu_ms = times.cpu_ms[name]
-        table.add_row(name, f"{cpu_ms:.2f}", f"{gpu_ms:.2f}", f"{cpu_ms / gpu_ms:.2f}")
+    for name, on_gpu in gpu_ms.items():
+        ratio = cpu_ms[name] / on_gpu
+        table.add_row(name, f"{cpu_ms[name]:.2f}", f"{on_gpu:.2f}", f"{ratio:.2f}")
     console.print(table)
 
 

@@ -19,9 +19,11 @@ from ldo_service.actors.topology import GRAPH
 from ldo_service.client import connect
 from ldo_service.detection.model_registry import Models
 from ldo_service.detection.onnx_network import CUDA, providers_of
-from ldo_service.errors import ConfigError, ModelError, install_command
+from ldo_service.errors import ConfigError, DeviceError, ModelError, install_command
 from ldo_service.gaussians import GaussianOptimizerConfig
 from ldo_service.gaussians.device_choice import choose_backend
+from ldo_service.kernels.gpu.benchmark_result import COMMAND
+from ldo_service.kernels.gpu.device import find_gpu
 from ldo_service.schemas import Health
 from ldo_service.schemas.topics import HEALTH
 from ldo_service.service.diagnostics import ActorStatus, diagnose, notes
@@ -190,8 +192,9 @@ def devices() -> Iterator[Finding]:
         f"{choice.reason}",
     )
     aligned = choose_aligner("auto").device
+    mark = "ok" if aligned.device == "cuda" else "note"
     yield Finding(
-        "note",
+        "warn" if aligned.has_failed else mark,
         f"service.device=auto chooses {aligned.device} ({aligned.name}) for the tracker: "
         f"{aligned.reason}",
     )
@@ -202,6 +205,26 @@ def devices() -> Iterator[Finding]:
         f"service.device=auto chooses {device} for the networks: the installed onnxruntime {has} "
         f"{CUDA}",
     )
+    yield from gpus()
+
+
+def gpus() -> Iterator[Finding]:
+    """Report whether the GPU has passed the benchmark; without a GPU, report nothing."""
+    try:
+        gpu = find_gpu()
+    except DeviceError:
+        return
+    result = gpu.benchmark()
+    if result is None:
+        yield Finding(
+            "note",
+            f"the GPU {gpu.name} is experimental until {COMMAND} has passed on it with the "
+            "installed versions",
+        )
+    elif result.has_passed:
+        yield Finding("ok", f"the GPU {gpu.name} has passed {COMMAND} ({result.scene})")
+    else:
+        yield Finding("warn", f"the GPU {gpu.name} has failed {COMMAND}: {result.error}")
 
 
 def networks() -> Iterator[Finding]:

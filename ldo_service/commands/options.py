@@ -53,7 +53,7 @@ Device = Annotated[
     argument(
         metavar="auto|cpu|cuda",
         help="device of mapper, tracker and networks, instead of service.device; auto uses a GPU "
-        "if it passes a self-test, cuda also for the tracker (experimental)",
+        "if `ldo bench --device cuda` measured it to be faster (experimental)",
     ),
 ]
 Source = Annotated[

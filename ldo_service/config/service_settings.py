@@ -113,9 +113,10 @@ class OfflineSettings:
 class ServiceSettings:
     """Live service (`ldo serve`), and the device for mapping, tracking and networks."""
 
-    # Device of the mapper's optimizer, of the tracker's alignment and of the networks. auto uses a
-    # GPU if it passes a self-test, but aligns on the CPU. cuda also aligns on the GPU. Mapping and
-    # alignment on a GPU are experimental. openvino applies to the networks alone.
+    # Device of the mapper's optimizer, of the tracker's alignment and of the networks. cuda uses a
+    # GPU that passes a self-test. With auto, `ldo bench --device cuda` must also have measured the
+    # GPU to be faster for mapper or tracker. Both are experimental on a GPU until then. openvino
+    # applies to the networks alone.
     device: Device = "cpu"
     # Actors that run in processes of their own. The default is the actor that uses gtsam, which
     # holds the GIL during every call.

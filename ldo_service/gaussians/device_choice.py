@@ -21,8 +21,8 @@ def choose_backend(
 ) -> tuple[OptimizerBackend, DeviceChoice]:
     """Return the backend of the Gaussian optimizer for the chosen device, and the device choice.
 
-    A GPU is chosen if `wanted` is cuda or auto and the GPU passes the self-test. Otherwise, the CPU
-    is chosen.
+    A GPU is chosen if `wanted` is cuda or auto and the GPU passes the self-test. With auto, it must
+    also have been faster in a saved benchmark; see `choose_device`. Otherwise, the CPU is chosen.
 
     Args:
         wanted: Setting `service.device`.

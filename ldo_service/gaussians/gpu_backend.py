@@ -8,6 +8,7 @@ from weakref import ref
 
 import numpy as np
 
+from ldo_service.errors import DeviceError
 from ldo_service.geometry import se3
 from ldo_service.kernels.gpu import descent, frame_loss, plane_rendering
 from ldo_service.kernels.gpu.arrays import Arrays
@@ -162,6 +163,12 @@ class GpuBackend:
             made.xi,
         )
         total = weights.l1 * l1 + weights.d_ssim * d_ssim + weights.depth * depth
+        if not np.isfinite([total, squared, *made.xi]).all():
+            # The pose would not be rigid in the next iteration.
+            raise DeviceError(
+                "the GPU computed NaN or infinity in the loss or in its derivative with respect to "
+                "the pose. If this happens again, set service.device=cpu."
+            )
         psnr_db = -10 * log10(max(squared, 1e-20))
         return ImageLoss(total, l1, d_ssim, depth, psnr_db), visible
 

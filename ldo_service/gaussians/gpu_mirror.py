@@ -5,6 +5,7 @@ from weakref import ref
 
 import numpy as np
 
+from ldo_service.errors import DeviceError
 from ldo_service.kernels.gpu.arrays import Arrays
 
 from .adam import Adam, places_of_remaining
@@ -66,7 +67,11 @@ class GaussianMirror:
             self._put(self.rows, changed, gaussians.rows[changed])
 
     def write_back(self, gaussians: GaussianMap, adam: Adam) -> None:
-        """Download the rows, Adam moments and step counts that changed on the GPU."""
+        """Download the rows, Adam moments and step counts that changed on the GPU.
+
+        Raises:
+            DeviceError: A downloaded value is NaN or infinite. The map is unchanged.
+        """
         state = adam.arguments(gaussians)
         n = len(gaussians)
         steps = self._arrays.download(self.steps)[:n]
@@ -79,7 +84,13 @@ class GaussianMirror:
             self._arrays.download(self._arrays.take(array, places))
             for array in (self.rows, self.moments, self.squares)
         )
-        # The map changes only after the last download, so that a failed device leaves it as it was.
+        # The map changes only after the last check, so that a failed device leaves it as it was.
+        for name, values in (("rows", rows), ("moments", moments), ("squared moments", squares)):
+            if not np.isfinite(values).all():
+                raise DeviceError(
+                    f"the GPU computed NaN or infinity in the {name} of the map. If this happens "
+                    "again, set service.device=cpu."
+                )
         gaussians.rows[touched] = self._known[touched] = rows
         state.mean[touched], state.square[touched] = moments, squares
         state.steps[touched] = steps[touched]

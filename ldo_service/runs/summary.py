@@ -110,6 +110,8 @@ def summarize(
 def devices(metrics: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
     """Return the device of each actor that can use a GPU, and the GPU if any actor used it.
 
+    A GPU that failed is named too, because it may have computed the first results.
+
     Args:
         metrics: Metrics at the end, by actor.
     """
@@ -118,7 +120,7 @@ def devices(metrics: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
     return {
         "devices": {name: "cuda" if on_gpu[name] else "cpu" for name in sorted(on_gpu)},
         "devices_failed": failed,
-        "gpu": gpu_facts("cuda") if any(on_gpu.values()) else {},
+        "gpu": gpu_facts("cuda") if failed or any(on_gpu.values()) else {},
     }
 
 

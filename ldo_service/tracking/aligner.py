@@ -96,20 +96,12 @@ class Aligner:
 def choose_aligner(wanted: str) -> Aligner:
     """Choose a device, and return the direct alignment on it.
 
-    If `wanted` is cuda, a GPU that passes the self-test aligns frames. If `wanted` is auto, the CPU
-    aligns frames, because no GPU has been measured to be faster. The speed is not measured at each
-    start, because then the choice, and the bits of the results, could change from run to run.
+    A GPU aligns frames if it passes the self-test. With auto, it must also have been faster in a
+    saved benchmark; see `choose_device`.
 
     Args:
         wanted: Setting `service.device`.
     """
-    if wanted == "auto":
-        return Aligner(
-            device=on_cpu(
-                "no GPU has been measured to be faster. "
-                "`ldo bench --device cuda` measures yours, and service.device=cuda uses it."
-            )
-        )
 
     def make(arrays: Arrays) -> Linearizer:
         # Both modules import Triton, which is optional.

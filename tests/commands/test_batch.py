@@ -53,6 +53,19 @@ def test_batch_prints_a_table_and_writes_a_report_with_pictures(
     assert re.search(r"│ desk +│ kept +│", out)
 
 
+def test_device_of_the_option_applies_to_all_recordings(
+    capsys, night: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")  # The CPU replaces the missing GPU.
+    where = tmp_path / "out"
+    code, _, _ = ldo(capsys, "batch", night, "--out", where, "--device", "cuda", *QUICK)
+    assert code == 0
+    (summary,) = (json.loads(path.read_text()) for path in where.glob("desk-*/summary.json"))
+    assert {"mapper", "tracker"} <= set(summary["devices_failed"])
+    (outcome,) = json.loads((where / "batch.json").read_text())["recordings"]
+    assert any("no GPU can be used" in note for note in outcome["notes"])
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [

@@ -2,6 +2,7 @@
 
 import importlib.util
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
@@ -17,6 +18,7 @@ from ldo_service.transport.certificate_authority import CertificateAuthority
 from ldo_service.transport.endpoint import Endpoint
 from ldo_service.transport.keys import TlsKeys
 from ldo_service.transport.zenoh_transport import open_session
+from tests.kernels.gpu.saved_times import save_failure, save_times
 from tests.ports import free_port
 from tests.service.test_diagnostics import health, inputs
 
@@ -100,32 +102,80 @@ def fail(*_: object) -> None:
     raise DeviceError("the loss differs.")
 
 
-def test_devices_without_a_gpu_are_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ldo_service.kernels.gpu.device.find_gpu", missing_gpu)
+def find(monkeypatch: pytest.MonkeyPatch, found: Callable[[], Gpu], tmp_path: Path) -> None:
+    """Replace the search for a GPU, without a saved benchmark."""
+    monkeypatch.setenv("LDO_CACHE", str(tmp_path))
+    for module in ("kernels.gpu.device", "commands.doctor"):
+        monkeypatch.setattr(f"ldo_service.{module}.find_gpu", found)
+
+
+def test_devices_without_a_gpu_are_the_cpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    find(monkeypatch, missing_gpu, tmp_path)
     mapper, tracker, networks = doctor.devices()
     assert (mapper.mark, tracker.mark, networks.mark) == ("note", "note", "note")
-    assert "for the tracker: no GPU has been measured to be faster" in tracker.text
-    assert mapper.text.startswith("service.device=auto chooses cpu (")
-    assert mapper.text.endswith("for the mapper: there is no GPU.")
+    for actor, finding in (("mapper", mapper), ("tracker", tracker)):
+        assert finding.text.startswith("service.device=auto chooses cpu (")
+        assert finding.text.endswith(f"for the {actor}: there is no GPU.")
     assert "chooses cpu for the networks" in networks.text
 
 
-@pytest.mark.skipif(not TRITON, reason="`make gpu-check` installs Triton")
-def test_gpu_that_fails_the_self_test_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ldo_service.kernels.gpu.device.find_gpu", gpu)
-    monkeypatch.setattr("ldo_service.gaussians.gpu_self_test.run_self_test", fail)
-    mapper, *_ = doctor.devices()
-    assert mapper.mark == "warn"
-    assert mapper.text.endswith("the GPU Some GPU failed: the loss differs.")
+def test_gpu_without_a_benchmark_is_experimental(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find(monkeypatch, gpu, tmp_path)
+    mapper, tracker, _, experimental = doctor.devices()
+    for finding in (mapper, tracker):
+        assert finding.mark == "note"
+        assert "chooses cpu (" in finding.text
+        assert "`ldo bench --device cuda` has not run on Some GPU" in finding.text
+    assert experimental.mark == "note"
+    assert experimental.text.startswith(
+        "the GPU Some GPU is experimental until `ldo bench --device cuda` has passed on it"
+    )
+
+
+def test_gpu_that_failed_the_benchmark_is_a_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find(monkeypatch, gpu, tmp_path)
+    save_failure(gpu(), "the loss differs.")
+    mapper, _, _, benchmark = doctor.devices()
+    assert "chooses cpu (" in mapper.text
+    assert benchmark.mark == "warn"
+    assert benchmark.text == (
+        "the GPU Some GPU has failed `ldo bench --device cuda`: the loss differs."
+    )
 
 
 @pytest.mark.skipif(not TRITON, reason="`make gpu-check` installs Triton")
-def test_gpu_that_passes_the_self_test_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ldo_service.kernels.gpu.device.find_gpu", gpu)
+@pytest.mark.parametrize("actor", ["mapper", "tracker"])
+def test_gpu_that_fails_the_self_test_is_a_warning(
+    actor: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find(monkeypatch, gpu, tmp_path)
+    save_times(gpu(), {"iteration": 9.0, "alignment": 9.0}, {"iteration": 1.0, "alignment": 1.0})
+    for module in ("gaussians.gpu_self_test", "tracking.alignment_self_test"):
+        monkeypatch.setattr(f"ldo_service.{module}.run_self_test", fail)
+    (finding,) = (finding for finding in doctor.devices() if f"for the {actor}" in finding.text)
+    assert finding.mark == "warn"
+    assert finding.text.endswith("the GPU Some GPU failed: the loss differs.")
+
+
+@pytest.mark.skipif(not TRITON, reason="`make gpu-check` installs Triton")
+def test_gpu_that_was_faster_and_passes_the_self_test_is_chosen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find(monkeypatch, gpu, tmp_path)
+    save_times(gpu(), {"iteration": 9.0, "alignment": 1.0}, {"iteration": 1.0, "alignment": 2.0})
     monkeypatch.setattr("ldo_service.gaussians.gpu_self_test.run_self_test", lambda _: None)
-    mapper, *_ = doctor.devices()
-    assert mapper.mark == "ok"
+    mapper, tracker, _, benchmark = doctor.devices()
+    assert (mapper.mark, tracker.mark, benchmark.mark) == ("ok", "note", "ok")
     assert "chooses cuda (Some GPU) for the mapper: the GPU passed the self-test." in mapper.text
+    assert "1.00 ms per iteration on Some GPU, and 9.00 ms on the CPU" in mapper.text
+    assert "2.00 ms per alignment on Some GPU, and 1.00 ms on the CPU" in tracker.text
+    assert benchmark.text == (
+        "the GPU Some GPU has passed `ldo bench --device cuda` (640x480 pixels)"
+    )
 
 
 @pytest.mark.parametrize(("days", "mark"), [(40, "ok"), (10, "warn")])

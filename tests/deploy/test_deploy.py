@@ -377,7 +377,8 @@ def test_service_on_a_gpu_differs_from_that_on_the_cpu_by_its_device() -> None:
     assert (DEPLOY / ours["build"]["context"] / ours["build"]["dockerfile"]).is_file()
     volume, folder = ours["volumes"][0].split(":")
     assert volume in gpu["volumes"]
-    assert f"TRITON_CACHE_DIR={folder}" in (DEPLOY / "Dockerfile.cuda").read_text()
+    image = (DEPLOY / "Dockerfile.cuda").read_text()
+    assert f"TRITON_CACHE_DIR={folder} LDO_CACHE={folder}/" in image
 
 
 def test_only_the_extra_for_a_gpu_needs_torch() -> None:

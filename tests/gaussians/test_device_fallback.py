@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from ldo_service.gaussians.exposure import Exposure
 from ldo_service.gaussians.optimizer_backend import CpuBackend
 from ldo_service.kernels.gpu.arrays import HostArrays
 from ldo_service.kernels.gpu.device import Gpu
+from tests.kernels.gpu.saved_times import save_times
 
 CONFIG = GaussianOptimizerConfig(rotation_rate_rad=1e-3, translation_rate_m=1e-3)
 PLAN = [4, 0, 4, 8]
@@ -208,7 +210,7 @@ def test_unexpected_error_of_the_self_test_selects_the_cpu(
     gpu = Gpu("Some GPU", {}, HostArrays())
     monkeypatch.setattr("ldo_service.kernels.gpu.device.find_gpu", lambda: gpu)
     monkeypatch.setattr(gpu_self_test, "run_self_test", self_test)
-    backend, choice = choose_backend("auto", CONFIG.adam, CONFIG.loss, CONFIG.limits)
+    backend, choice = choose_backend("cuda", CONFIG.adam, CONFIG.loss, CONFIG.limits)
     assert type(backend) is CpuBackend
     assert "the self-test failed with TypeError: launch() takes 3 arguments" in choice.reason
     assert "in self_test" in caplog.text  # The traceback.
@@ -217,7 +219,7 @@ def test_unexpected_error_of_the_self_test_selects_the_cpu(
 @pytest.mark.parametrize("error", [None, DeviceError("the loss differs.")])
 @pytest.mark.parametrize("wanted", ["auto", "cuda"])
 def test_gpu_is_chosen_if_it_passes_the_self_test(
-    wanted: str, error: DeviceError | None, monkeypatch: pytest.MonkeyPatch
+    wanted: str, error: DeviceError | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("triton", reason="`make gpu-check` installs Triton")
     from ldo_service.gaussians import gpu_self_test
@@ -229,6 +231,9 @@ def test_gpu_is_chosen_if_it_passes_the_self_test(
     gpu = Gpu("Some GPU", {"triton": "3"}, HostArrays())
     monkeypatch.setattr("ldo_service.kernels.gpu.device.find_gpu", lambda: gpu)
     monkeypatch.setattr(gpu_self_test, "run_self_test", self_test)
+    monkeypatch.setenv("LDO_CACHE", str(tmp_path))
+    if wanted == "auto":
+        save_times(gpu, {"iteration": 2.0}, {"iteration": 1.0})
     backend, choice = choose_backend(wanted, CONFIG.adam, CONFIG.loss, CONFIG.limits)
     assert choice.has_failed == bool(error)
     assert backend.can_fail == (error is None)

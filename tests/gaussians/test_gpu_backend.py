@@ -14,9 +14,10 @@ from ldo_service.gaussians import (
     densify,
 )
 from ldo_service.geometry import se3
+from ldo_service.kernels.gpu.arrays import HostArray
 from tests.gaussians.conftest import FEW, halved, window
 from tests.kernels.gpu.agreement import check
-from tests.kernels.gpu.scenes import ARRAYS, descent, frame_loss, plane_rendering
+from tests.kernels.gpu.scenes import ARRAYS, FilledArrays, descent, frame_loss, plane_rendering
 
 CONFIG = GaussianOptimizerConfig(half_share=0.2, usual_reach=500)
 
@@ -136,6 +137,39 @@ def test_iterations_on_a_small_window_agree_with_the_cpu(room: Sequence) -> None
 def test_ten_iterations_through_the_mirror_agree_with_the_cpu(room: Sequence) -> None:
     gpu = compare(room, 64, [[4, 0, 4, 4], [8, 0, 8], [8, 4, 8]])
     assert len(gpu.losses) == 10
+
+
+class PoisonedArrays(FilledArrays):
+    """Arrays of a device that downloads NaN in the first value of the arrays of one width."""
+
+    def __init__(self, width: int) -> None:
+        self.width = width
+
+    def download(self, array: HostArray) -> np.ndarray:
+        values = super().download(array)
+        if values.shape[1:] == (self.width,):
+            values[0, 0] = np.nan
+        return values
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("what", "width"), [("rows of the map", 16), ("loss", 8)])
+def test_cpu_repeats_a_plan_whose_results_are_nan(
+    room: Sequence, what: str, width: int, monkeypatch: pytest.MonkeyPatch, caplog
+) -> None:
+    monkeypatch.setattr("tests.gaussians.test_gpu_backend.ARRAYS", PoisonedArrays(width))
+    cpu, gpu = (Mapping(room, 32, on_gpu=on_gpu) for on_gpu in (False, True))
+    for mapping in (cpu, gpu):
+        mapping.insert(0)
+        mapping.insert(4)
+        mapping.fit([4])
+    assert gpu.optimizer.device.metrics() == {"device_failed": 1, "on_gpu": 0}
+    assert f"the GPU computed NaN or infinity in the {what}" in caplog.text
+    assert "no keyframe is lost" in caplog.text
+    assert gpu.losses == cpu.losses
+    np.testing.assert_array_equal(gpu.gaussians.rows, cpu.gaussians.rows)
+    for name, values in cpu.optimizer.snapshot().items():
+        np.testing.assert_array_equal(gpu.optimizer.snapshot()[name], values)
 
 
 def test_images_are_uploaded_again_if_they_changed(room: Sequence) -> None:

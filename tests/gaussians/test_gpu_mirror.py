@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from ldo_service.errors import DeviceError
 from ldo_service.gaussians import GaussianMap
 from ldo_service.gaussians.adam import Adam
 from ldo_service.gaussians.gpu_mirror import GaussianMirror
@@ -61,6 +62,21 @@ def test_steps_on_the_device_reach_map_and_moments(followed: tuple) -> None:
     np.testing.assert_array_equal(state.square[::3], wanted[::3] ** 2)
     assert not state.mean[1::3].any()
     assert_equals_original(mirror, gaussians, adam)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("name", ["rows", "moments", "squares"])
+def test_value_that_is_not_finite_changes_no_map(followed: tuple, name: str, value: float) -> None:
+    gaussians, adam, mirror = followed
+    rows, state, version = gaussians.rows.copy(), adam.snapshot(), gaussians.version
+    step_on_device(mirror, np.array([2, 5]))
+    getattr(mirror, name).values[5, 3] = value
+    with pytest.raises(DeviceError, match="NaN or infinity in the"):
+        mirror.write_back(gaussians, adam)
+    np.testing.assert_array_equal(gaussians.rows, rows)
+    assert gaussians.version == version
+    for key, values in adam.snapshot().items():
+        np.testing.assert_array_equal(values, state[key])
 
 
 def test_only_changed_rows_are_uploaded(followed: tuple) -> None:

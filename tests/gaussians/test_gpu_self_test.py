@@ -104,7 +104,7 @@ def test_keyframe_of_a_lost_device_is_mapped_by_the_cpu(
     gpu = Gpu("interpreter", {"triton": "3.7.1"}, arrays)
     monkeypatch.setattr("ldo_service.kernels.gpu.device.find_gpu", lambda: gpu)
     monkeypatch.setattr("ldo_service.gaussians.gpu_self_test.run_self_test", lambda _: None)
-    builder = MapBuilder(config_for("auto"), folder=tmp_path / "gpu")
+    builder = MapBuilder(config_for("cuda"), folder=tmp_path / "gpu")
     add(builder, room, 0)
     assert builder.metrics()["on_gpu"] == 1
     assert builder.fitting.iterations > 0

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from ldo_service.datasets import open_sequence
+from ldo_service.storage.cache_folder import cache_root
 from ldo_service.synthetic import FlatSequence
-from ldo_service.synthetic.flat import cache
 from ldo_service.synthetic.flat.corridor import (
     EQUAL,
     OBJECTS,
@@ -27,7 +27,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Return the cache folder of this module."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("LDO_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield cache.cache_root()
+        yield cache_root()
 
 
 @pytest.fixture(scope="module")

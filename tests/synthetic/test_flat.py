@@ -13,6 +13,7 @@ import pytest
 from ldo_service.datasets import open_sequence
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry import RgbdFrame, se3
+from ldo_service.storage.cache_folder import cache_root
 from ldo_service.synthetic import FlatConfig, FlatSequence
 from ldo_service.synthetic.flat import CLASS_NAMES, COCO_COUNT, cache
 from ldo_service.synthetic.flat.__main__ import contents, motion
@@ -29,7 +30,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Return the cache folder of this module."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("LDO_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield cache.cache_root()
+        yield cache_root()
 
 
 @pytest.fixture(scope="module")

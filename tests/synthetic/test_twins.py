@@ -10,8 +10,9 @@ import pytest
 
 from ldo_service.datasets import open_sequence
 from ldo_service.geometry import se3
+from ldo_service.storage.cache_folder import cache_root
 from ldo_service.synthetic import FlatSequence
-from ldo_service.synthetic.flat import CLASS_NAMES, COCO_COUNT, cache
+from ldo_service.synthetic.flat import CLASS_NAMES, COCO_COUNT
 from ldo_service.synthetic.flat.render import FlatRenderer
 from ldo_service.synthetic.flat.scene import Flat
 from ldo_service.synthetic.flat.twins import (
@@ -38,7 +39,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Return the cache folder of this module."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("LDO_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield cache.cache_root()
+        yield cache_root()
 
 
 @pytest.fixture(scope="module")

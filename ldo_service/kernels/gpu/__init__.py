@@ -14,4 +14,5 @@ but importing a module with kernels does.
 - `plane_rendering`, `frame_loss`, `descent`: functions that launch the kernels of one iteration.
 - `equation_sums`: functions that launch the kernels of one step of the alignment.
 - `device`: search for a GPU, and choice between it and the CPU.
+- `benchmark_result`: saved results of `ldo bench --device cuda`, for this choice.
 """

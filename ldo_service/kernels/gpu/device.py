@@ -6,12 +6,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib import import_module
+from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+from ldo_service import __version__
 from ldo_service.errors import DeviceError, install_command
 from ldo_service.kernels import isa
 
 from .arrays import Arrays, TorchArrays
+from .benchmark_result import COMMAND, STEPS, BenchmarkResult, saved_result
 
 log = logging.getLogger(__name__)
 
@@ -19,6 +22,7 @@ Device = Literal["auto", "cpu", "cuda", "openvino"]
 Made = TypeVar("Made")
 # Lowest compute capability for which `make gpu-check` compiles the kernels, times 10.
 MIN_CAPABILITY = 75
+DRIVER = Path("/sys/module/nvidia/version")  # Version of the loaded driver.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -27,14 +31,23 @@ class Gpu:
 
     Attributes:
         name: Model, such as "NVIDIA GeForce RTX 3090".
-        versions: Versions of libraries and hardware on which the bits of the results depend, by
-            name.
+        versions: Versions of hardware, driver and libraries on which the bits of the results
+            depend, by name.
         arrays: Arrays on this GPU.
     """
 
     name: str
     versions: dict[str, str]
     arrays: Arrays
+
+    @property
+    def versions_and_ours(self) -> dict[str, str]:
+        """Return `versions` with the version of LDO-SLAM, by which benchmark results are saved."""
+        return {**self.versions, "ldo-slam": __version__}
+
+    def benchmark(self) -> BenchmarkResult | None:
+        """Return the saved result of `ldo bench --device cuda`; None without one."""
+        return saved_result(self.name, self.versions_and_ours)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +58,8 @@ class DeviceChoice:
         device: cpu or cuda.
         reason: Sentence that says why this device was chosen.
         name: Instruction set of the CPU, or model of the GPU.
-        versions: Versions of libraries and hardware on which the bits of the results depend;
-            empty on the CPU.
+        versions: Versions of hardware, driver and libraries on which the bits of the results
+            depend; empty on the CPU.
         has_failed: True if the CPU is used although a GPU was found or requested.
     """
 
@@ -75,9 +88,13 @@ def choose_device(
 ) -> tuple[Made | None, DeviceChoice]:
     """Choose a device: a GPU if it passes a self-test, otherwise the CPU.
 
+    The setting auto also requires a saved benchmark in which this GPU passed and was faster than
+    the CPU. The speed is not measured at the start, because the choice, and with it the bits of the
+    results, could then change from start to start.
+
     Args:
-        wanted: Setting `service.device`. The settings auto and cuda use a GPU if there is one. A
-            missing GPU counts as a failure with cuda, but not with auto.
+        wanted: Setting `service.device`. A missing GPU counts as a failure with cuda, but not with
+            auto.
         actor: Actor that uses the device, for the log.
         work: What the device does, such as "the map is fitted", for the log.
         make: Function that runs the self-test on a GPU and returns the object that computes on this
@@ -95,6 +112,9 @@ def choose_device(
         if choice.has_failed:
             log.warning("%s: no GPU can be used, so %s on the CPU: %s", actor, work, error)
         return None, choice
+    is_faster, measured = _judged(gpu, actor)
+    if wanted == "auto" and not is_faster:
+        return None, on_cpu(measured)
     try:
         with device_errors("self-test"):
             made = make(gpu.arrays)
@@ -108,9 +128,20 @@ def choose_device(
             exc_info=error.__cause__,
         )
         return None, choice
-    reason = "the GPU passed the self-test."
-    log.info("%s: %s on %s (experimental): %s", actor, work, gpu.name, reason)
+    reason = f"the GPU passed the self-test. {measured}"
+    log.info("%s: %s on %s: %s", actor, work, gpu.name, reason)
     return made, DeviceChoice("cuda", reason, gpu.name, gpu.versions)
+
+
+def _judged(gpu: Gpu, actor: str) -> tuple[bool, str]:
+    """Return whether a saved benchmark says that the GPU is faster, and a sentence about it."""
+    result = gpu.benchmark()
+    if result is None:
+        return False, (
+            f"{COMMAND} has not run on {gpu.name} with these versions yet, so the GPU is "
+            "experimental."
+        )
+    return result.is_faster(actor), result.text(actor)
 
 
 def find_gpu() -> Gpu:
@@ -164,6 +195,7 @@ def _found(torch: Any, triton: Any) -> Gpu:
         )
     found = {
         "compute capability": f"{major}.{minor}",
+        "driver": _driver_version(),
         "cuda": str(torch.version.cuda),
         "torch": str(torch.__version__),
         "triton": str(triton.__version__),
@@ -179,7 +211,8 @@ def gpu_facts(device: str) -> dict[str, str]:
         device: Setting `service.device`.
 
     Returns:
-        Facts by name; empty if only the CPU is used, or if torch finds no GPU.
+        Facts by name; empty if only the CPU is used, or if torch finds no GPU. With auto, the facts
+        include the device that the saved benchmark selects for mapper and tracker.
     """
     if device not in ("auto", "cuda"):
         return {}
@@ -187,7 +220,18 @@ def gpu_facts(device: str) -> dict[str, str]:
         gpu = find_gpu()
     except DeviceError:
         return {}
-    return {"gpu": gpu.name, **gpu.versions}
+    facts = {"gpu": gpu.name, **gpu.versions}
+    if device == "auto":
+        facts |= {actor: "cuda" if _judged(gpu, actor)[0] else "cpu" for actor in STEPS}
+    return facts
+
+
+def _driver_version() -> str:
+    """Return the version of the driver of NVIDIA; "unknown" where the system does not state it."""
+    try:
+        return DRIVER.read_text().strip()
+    except OSError:
+        return "unknown"
 
 
 def _library(name: str) -> Any:

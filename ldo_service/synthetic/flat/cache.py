@@ -2,7 +2,6 @@
 
 import hashlib
 import logging
-import os
 import shutil
 import struct
 from collections.abc import Callable
@@ -16,6 +15,7 @@ import zstandard
 from ldo_service.errors import FrameError
 from ldo_service.geometry import codecs
 from ldo_service.storage.atomic_write import write_atomically
+from ldo_service.storage.cache_folder import cache_root
 
 log = logging.getLogger(__name__)
 
@@ -33,16 +33,6 @@ class CachedFrame:
     depth_m: np.ndarray  # Depth [H, W] float32; 0 where unknown.
     class_ids: np.ndarray  # Class per pixel [H, W] uint8.
     instance_ids: np.ndarray  # Object per pixel [H, W] uint16; 0 for the building.
-
-
-def cache_root() -> Path:
-    """Return the folder named by the environment variable LDO_CACHE.
-
-    If LDO_CACHE is not set, the folder is `ldo-slam` in the user's cache folder.
-    """
-    if folder := os.environ.get("LDO_CACHE"):
-        return Path(folder).expanduser()
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ldo-slam"
 
 
 class FrameCache:

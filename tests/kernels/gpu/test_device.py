@@ -1,11 +1,13 @@
 """Search for a GPU, with a stand-in for torch."""
 
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from ldo_service.errors import DeviceError
+from ldo_service.kernels.gpu import device
 from ldo_service.kernels.gpu.device import find_gpu, gpu_facts
 
 
@@ -30,8 +32,18 @@ def test_gpu_has_model_and_versions() -> None:
     assert gpu.versions["torch"] == "2.13.0"
     assert gpu.versions["triton"] == "3.7.1"
     assert gpu.versions["compute capability"] == "8.6"
-    assert gpu_facts("cuda") == gpu_facts("auto") == {"gpu": "Some GPU", **gpu.versions}
+    assert gpu_facts("cuda") == {"gpu": "Some GPU", **gpu.versions}
     assert gpu_facts("cpu") == {}
+
+
+@pytest.mark.usefixtures("torch")
+def test_version_of_the_driver_is_that_of_the_loaded_module(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(device, "DRIVER", tmp_path / "version")
+    assert find_gpu().versions["driver"] == "unknown"
+    (tmp_path / "version").write_text("580.65.06\n")
+    assert find_gpu().versions["driver"] == "580.65.06"
 
 
 def test_missing_gpu_is_an_error(torch: SimpleNamespace) -> None:

@@ -1,6 +1,7 @@
 """Benchmarks of a GPU, with the interpreter of Triton as the GPU."""
 
 import json
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,8 +19,9 @@ SMALL = ("bench", "render", "--device", "cuda", "--gaussians", "30", "--size", "
 
 
 @pytest.fixture(autouse=True)
-def _interpreter(monkeypatch: pytest.MonkeyPatch) -> None:
+def _interpreter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Use the interpreter as the GPU, without the self-test, which takes half a minute."""
+    monkeypatch.setenv("LDO_CACHE", str(tmp_path))
     for name in ("ldo_service.commands.bench.find_gpu", "tests.bench.bench_gpu.required_gpu"):
         monkeypatch.setattr(name, lambda: GPU)
     monkeypatch.setattr(device_iteration, "run_self_test", lambda *_: None)
@@ -40,6 +42,11 @@ def test_times_of_both_devices_are_measured(capsys: pytest.CaptureFixture[str]) 
         }
         assert all(time_ms > 0 for time_ms in times_ms.values())
     assert facts["gpu_ms"]["iteration"] > facts["cpu_ms"]["iteration"]
+    result = GPU.benchmark()
+    assert result is not None
+    assert (result.cpu_ms, result.gpu_ms) == (facts["cpu_ms"], facts["gpu_ms"])
+    assert result.scene.startswith("16x16 pixels, 30 Gaussians, ")
+    assert not result.is_faster("mapper")
 
 
 def test_wrong_results_are_not_timed(
@@ -52,6 +59,10 @@ def test_wrong_results_are_not_timed(
     assert "the GPU failed or differed from the CPU in an iteration" in err
     assert "at 16x16 pixels with 30 Gaussians" in err
     assert "No times were measured." in err
+    result = GPU.benchmark()
+    assert result is not None
+    assert "No times were measured." in result.error
+    assert not result.is_faster("mapper")
 
 
 def test_wrong_alignments_are_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
