@@ -65,10 +65,13 @@ def region_view(
     box_px: np.ndarray,
     part: Foreground,
     config: ViewConfig,
-) -> RegionView:
+    min_quality: float = 0.0,
+) -> RegionView | None:
     """Crop the view of a region from a keyframe, and rate the quality of the view.
 
-    The quality is the product of the size, border, sharpness and facing factors.
+    The quality is the product of the size, border, sharpness and facing factors. No factor exceeds
+    1. The function therefore stops as soon as the product of the known factors is below
+    `min_quality`.
 
     Args:
         keyframe: Id of the keyframe.
@@ -78,17 +81,24 @@ def region_view(
         box_px: Box of the region, [4], x0 y0 x1 y1, pixels.
         part: Mask of the region.
         config: Settings.
+        min_quality: Minimum quality of the view, 0..1.
+
+    Returns:
+        The view; None if its quality is below `min_quality`.
     """
+    quality = size_factor(box_px, config) * border_factor(box_px, depth_m.shape, config)
+    if quality < min_quality:
+        return None
     x0, y0, x1, y1 = (float(v) for v in box_px)
     margin = config.context * np.array([x1 - x0, y1 - y0])
     grown = np.array([*(box_px[:2] - margin), *(box_px[2:] + margin)])
     crop = shrunk(color[pixels_of(grown, depth_m.shape)], config.side_px)
-    quality = (
-        size_factor(box_px, config)
-        * border_factor(box_px, depth_m.shape, config)
-        * sharpness_factor(crop, config)
-        * facing_factor(depth_m, camera, part, config)
-    )
+    quality *= sharpness_factor(crop, config)
+    if quality < min_quality:
+        return None
+    quality *= facing_factor(depth_m, camera, part, config)
+    if quality < min_quality:
+        return None
     height, width = crop.shape[:2]
     jpeg = codecs.encode_jpeg(crop)
     return RegionView(keyframe, (x0, y0, x1, y1), float(quality), width, height, jpeg)
