@@ -158,10 +158,9 @@ class MapBuilder:
         exposure: Exposure,
         dynamic_mask: np.ndarray | None,
     ) -> None:
-        color = exposure.removed(frame.color * np.float32(1 / 255))
         densify(
             self.gaussians,
-            replace(frame, color=(255 * color + 0.5).astype(np.uint8)),
+            replace(frame, color=exposure.removed_from_image(frame.color)),
             T_map_camera,
             keyframe,
             self.config.insertion,
