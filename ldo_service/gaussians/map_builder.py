@@ -164,6 +164,7 @@ class MapBuilder:
             self.config.insertion,
             before=before,
             ignore_mask=dynamic_mask,
+            memory=self._renderer.memory,
             threads=self._threads,
         )
         self._log.mark_added(self.gaussians)
