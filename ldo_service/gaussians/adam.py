@@ -249,7 +249,9 @@ class Adam:
         self._steps[first + places] = steps[first + old_places]
         self._reserve(len(ids))
         remaining = len(places)
-        is_together = remaining == 0 or places[-1] == remaining - 1  # No row lies between them.
+        is_together = (
+            remaining == 0 or places[-1] == remaining - 1
+        )  # They have no new rows between them.
         for moment in self._moments:
             if is_together:
                 keep_rows(moment, first, first + old_places)
