@@ -12,7 +12,7 @@ from ldo_service.kernels import _adam
 
 from .model import GaussianMap
 from .renderer import AdamStep, Rasterizer, RowGradients, VisibleGaussians
-from .rows import aligned_rows
+from .rows import aligned_rows, keep_rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,10 +248,18 @@ class Adam:
         self._steps[:first] = steps[:first]
         self._steps[first + places] = steps[first + old_places]
         self._reserve(len(ids))
+        remaining = len(places)
+        is_together = (
+            remaining == 0 or places[-1] == remaining - 1
+        )  # They have no new rows between them.
         for moment in self._moments:
-            kept = moment[first + old_places]
-            moment[first : max(n, len(ids))] = 0
-            moment[first + places] = kept
+            if is_together:
+                keep_rows(moment, first, first + old_places)
+                moment[first + remaining : max(n, len(ids))] = 0
+            else:
+                kept = moment[first + old_places]
+                moment[first : max(n, len(ids))] = 0
+                moment[first + places] = kept
 
     def _reserve(self, n: int) -> None:
         for k, moment in enumerate(self._moments):

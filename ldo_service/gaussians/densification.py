@@ -14,8 +14,9 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, RgbdFrame, se3
 
 from .cells import QuadtreeCells, quadtree
+from .loss import TILE
 from .model import GaussianMap
-from .renderer import Rendering, render
+from .renderer import Rasterizer, Rendering, RenderMemory, render
 from .rows import ROW
 
 # The renderer adds 0.3 px^2 to the variance of every splat. Densification subtracts this much of
@@ -244,6 +245,7 @@ def densify(
     *,
     before: Rendering | None = None,
     ignore_mask: np.ndarray | None = None,
+    memory: RenderMemory | None = None,
     threads: int = 1,
 ) -> np.ndarray:
     """Add Gaussians where a keyframe shows surface that the map lacks.
@@ -260,6 +262,7 @@ def densify(
         config: Settings.
         before: Rendering of the map at this pose; None to render it here.
         ignore_mask: Ignore mask, [H, W] bool; these pixels get no Gaussians.
+        memory: Scratch memory of the renderer; None to allocate it here.
         threads: Threads of the renderer.
 
     Returns:
@@ -268,12 +271,15 @@ def densify(
     config = config or DensificationConfig()
     T_camera_map = se3.inverse(T_map_camera)
 
-    def seen() -> Rendering:
-        rows, bounds = gaussians.rows, gaussians.bounds
-        return render(rows, frame.camera, T_camera_map, bounds=bounds, threads=threads)
-
     # Find the unexplained pixels.
-    before = before or seen()
+    before = before or render(
+        gaussians.rows,
+        frame.camera,
+        T_camera_map,
+        bounds=gaussians.bounds,
+        memory=memory,
+        threads=threads,
+    )
     if ignore_mask is not None:
         frame = _without(frame, ignore_mask, before)
     depth_m = with_small_holes_filled(frame.depth_m, config.hole_px)
@@ -305,10 +311,32 @@ def densify(
 
     # Correct the colors, because overlapping neighbors blur them.
     new_colors = gaussians.colors[len(gaussians) - len(ids) :]
+    rasterizer, tiles = Rasterizer(threads=threads, memory=memory), tiles_of(cells, *wanted.shape)
     for _ in range(config.color_steps):
-        correct_colors(new_colors, cells, frame, seen(), config.max_color_step)
+        planes = rasterizer.render(
+            gaussians.rows, frame.camera, T_camera_map, bounds=gaussians.bounds, tiles=tiles
+        )
+        shown = np.asarray(cv2.merge([*planes[:3]]))
+        correct_colors(new_colors, cells, frame, shown, config.max_color_step)
         gaussians.touch(slice(len(gaussians) - len(ids), None))
     return ids
+
+
+def tiles_of(cells: QuadtreeCells, height: int, width: int) -> np.ndarray:
+    """Return which tiles of an image contain cells, [ceil(H / 16), ceil(W / 16)] uint8.
+
+    Args:
+        cells: The cells. Their places are multiples of their sizes, which are powers of 2.
+        height: Height H of the image.
+        width: Width W of the image.
+    """
+    tiles = np.zeros((-(-height // TILE), -(-width // TILE)), np.uint8)
+    row, column, across = cells.row // TILE, cells.column // TILE, -(-cells.size // TILE)
+    for down in range(across.max(initial=0)):
+        for right in range(across.max(initial=0)):
+            reaches = across > max(down, right)
+            tiles[row[reaches] + down, column[reaches] + right] = 1
+    return tiles
 
 
 def densification_mask(
@@ -371,7 +399,7 @@ def correct_colors(
     colors: np.ndarray,
     cells: QuadtreeCells,
     frame: RgbdFrame,
-    rendering: Rendering,
+    shown: np.ndarray,
     max_step: float,
 ) -> None:
     """Add the mean color error of its cell to the color of each new Gaussian.
@@ -383,10 +411,11 @@ def correct_colors(
         colors: Colors of the new Gaussians, [M, 3], 0..1; changed in place.
         cells: The cell of each Gaussian.
         frame: The keyframe.
-        rendering: Rendering of the map with the new Gaussians at the pose of the keyframe.
+        shown: Color of the map with the new Gaussians at the pose of the keyframe, [H, W, 3],
+            0..1. Pixels outside of the cells may have any color.
         max_step: Largest change of a color channel, 0..1.
     """
-    missing = cells.mean_of(_unit_range(frame.color) - rendering.color)
+    missing = cells.mean_of(_unit_range(frame.color) - shown)
     colors += missing.clip(-max_step, max_step)
     np.clip(colors, 0, 1, out=colors)
 

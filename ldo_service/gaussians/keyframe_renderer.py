@@ -10,7 +10,11 @@ from .renderer import Rendering, RenderMemory, render
 
 
 class KeyframeRenderer:
-    """Renderer of the Gaussians in memory; it caches the last rendering at a keyframe."""
+    """Renderer of the Gaussians in memory; it caches the last rendering at a keyframe.
+
+    Attributes:
+        memory: Scratch memory, which other renderings may use between two calls.
+    """
 
     def __init__(self, views: KeyframeViews, threads: int) -> None:
         """Create a renderer with an empty cache.
@@ -19,7 +23,7 @@ class KeyframeRenderer:
             views: Cameras and poses of the keyframes.
             threads: Threads of the renderer.
         """
-        self._views, self._threads, self._memory = views, threads, RenderMemory()
+        self._views, self._threads, self.memory = views, threads, RenderMemory()
         # Cached rendering of one keyframe; None after a change of the map.
         self._cached: tuple[int, Rendering] | None = None
 
@@ -44,7 +48,7 @@ class KeyframeRenderer:
             camera,
             se3.inverse(T_map_camera),
             bounds=gaussians.bounds,
-            memory=self._memory,
+            memory=self.memory,
             contributions=contributions,
             threads=self._threads,
         )

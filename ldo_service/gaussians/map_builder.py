@@ -100,11 +100,9 @@ class MapBuilder:
         self._renderer.forget()
         before = self.render_from(frame.camera, T_map_camera)
         counts = None if dynamic_mask is None else (~dynamic_mask).astype(np.uint8)
-        exposure = self._exposure(frame, before, counts)
-        self._insert(frame, T_map_camera, keyframe, before, exposure, dynamic_mask)
-        view = replace(
-            TrainingView.of(frame, T_map_camera, keyframe), exposure=exposure, mask=counts
-        )
+        view = replace(TrainingView.of(frame, T_map_camera, keyframe), mask=counts)
+        view = replace(view, exposure=self._exposure(view, before))
+        self._insert(frame, T_map_camera, keyframe, before, view.exposure, dynamic_mask)
         self._published.add(keyframe, T_map_camera)
         self._newest = keyframe
         for forgotten in self.views.add(view):
@@ -137,14 +135,14 @@ class MapBuilder:
         """
         return self._renderer.render_keyframe(self.gaussians, keyframe, contributions=contributions)
 
-    def _exposure(self, frame: RgbdFrame, before: Rendering, counts: np.ndarray | None) -> Exposure:
-        """Estimate the exposure of a frame relative to the map.
+    def _exposure(self, view: TrainingView, before: Rendering) -> Exposure:
+        """Estimate the exposure of a new keyframe relative to the map.
 
         If the estimate fails, for example because the map covers too little of the image, the
         exposure of the previous keyframe is returned. The first keyframe then gets gain 1, bias 0.
         """
-        rendered, seen = before.color.transpose(2, 0, 1), frame.color.transpose(2, 0, 1)
-        estimated = estimate_exposure(rendered, before.opacity, seen, counts)
+        rendered = before.color.transpose(2, 0, 1)
+        estimated = estimate_exposure(rendered, before.opacity, view.color, view.mask)
         if estimated is not None or self._newest is None:
             return estimated or Exposure()
         return self.views.exposures[self._newest]
@@ -158,15 +156,15 @@ class MapBuilder:
         exposure: Exposure,
         dynamic_mask: np.ndarray | None,
     ) -> None:
-        color = exposure.removed(frame.color * np.float32(1 / 255))
         densify(
             self.gaussians,
-            replace(frame, color=(255 * color + 0.5).astype(np.uint8)),
+            replace(frame, color=exposure.removed_from_image(frame.color)),
             T_map_camera,
             keyframe,
             self.config.insertion,
             before=before,
             ignore_mask=dynamic_mask,
+            memory=self._renderer.memory,
             threads=self._threads,
         )
         self._log.mark_added(self.gaussians)

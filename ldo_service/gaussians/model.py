@@ -12,7 +12,7 @@ from ldo_service.errors import DataError
 from ldo_service.geometry import se3
 from ldo_service.kernels._rasterize import Bounds
 
-from .rows import ROW, aligned_rows, move_rows
+from .rows import ROW, aligned_rows, keep_rows, move_rows
 
 # Bytes of a Gaussian's labels (`semantics.gaussian_labels`); all are 0 before any observation.
 LABEL_BYTES = 32
@@ -207,10 +207,10 @@ class GaussianMap:
         if not np.any(mask):
             return 0
         first = int(np.argmax(mask))  # Earlier rows stay in place.
-        keep = ~mask[first:]
-        size = first + int(np.count_nonzero(keep))
+        kept = first + np.flatnonzero(~mask[first:])
+        size = first + len(kept)
         for array in self._arrays:
-            array[first:size] = array[first : self._size][keep]
+            keep_rows(array, first, kept)
         self.touch(slice(first, None))
         removed, self._size = self._size - size, size
         self.membership += 1

@@ -9,9 +9,10 @@ import numpy as np
 from ldo_service.geometry import se3
 
 from .adam import Adam, AdamConfig
-from .exposure import Exposure, estimate_exposure
+from .exposure import Exposure, estimate_block_exposure
 from .loss import ImageLoss, LossWeights, image_loss
 from .model import GaussianMap
+from .prepared_images import PreparedImage, PreparedImages
 from .renderer import Rasterizer, VisibleGaussians
 from .training_views import TrainingView
 
@@ -120,8 +121,9 @@ class CpuBackend:
         self._rasterizer = Rasterizer(threads=threads)
         self._by_planes = np.empty((5, 0, 0), np.float32)
         self._gaussians: GaussianMap | None = None  # Map between `begin` and `end`.
-        # View of the last rendering in the resolution of the rendering, its planes and its binning.
-        self._rendered: tuple[TrainingView, np.ndarray, int] | None = None
+        self._images = PreparedImages()
+        # Images of the last rendering in the resolution of the rendering, its planes and binning.
+        self._rendered: tuple[PreparedImage, np.ndarray, int] | None = None
 
     @property
     def threads(self) -> int:
@@ -141,24 +143,25 @@ class CpuBackend:
         return self
 
     def render(self, view: TrainingView, *, is_half: bool) -> None:
-        image = view.halved() if is_half else view
+        prepared = self._images.get(view, is_half=is_half)
         binning = 2 if is_half else 1
         gaussians = self._map()
         planes = self._rasterizer.render(
             gaussians.rows,
-            image.camera,
+            prepared.image.camera,
             se3.inverse(view.T_map_camera),
             bounds=gaussians.bounds,
             binning=binning,
         )
-        self._rendered = image, planes, binning
+        self._rendered = prepared, planes, binning
 
     def estimate_exposure(self) -> Exposure | None:
-        image, planes, _ = self._last()
-        return estimate_exposure(planes[:3], planes[4], image.color, image.mask)
+        prepared, planes, _ = self._last()
+        return estimate_block_exposure(planes[:3], planes[4], prepared.blocks)
 
     def descend(self, exposure: Exposure, *, rate: float) -> tuple[ImageLoss, VisibleGaussians]:
-        image, planes, binning = self._last()
+        prepared, planes, binning = self._last()
+        image = prepared.image
         if self._by_planes.shape != planes.shape:
             self._by_planes = np.empty_like(planes)
         loss = image_loss(
@@ -188,7 +191,7 @@ class CpuBackend:
         assert self._gaussians is not None, "begin comes first"
         return self._gaussians
 
-    def _last(self) -> tuple[TrainingView, np.ndarray, int]:
+    def _last(self) -> tuple[PreparedImage, np.ndarray, int]:
         assert self._rendered is not None, "render comes first"
         return self._rendered
 

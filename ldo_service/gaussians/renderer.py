@@ -87,11 +87,15 @@ class Rasterizer:
     """Renderer for the optimizer; the renderer reuses its memory from image to image.
 
     Its images equal those of `render`, but have no median depth. Not thread-safe.
+
+    Args:
+        threads: Threads of the kernels.
+        memory: Scratch memory to use; None for memory of its own.
     """
 
-    def __init__(self, *, threads: int = 1) -> None:
+    def __init__(self, *, threads: int = 1, memory: "RenderMemory | None" = None) -> None:
         self.threads = threads
-        self._pass = _rasterize.Pass()
+        self._pass = memory or _rasterize.Pass()
         self._planes = np.empty((PLANES, 0, 0), np.float32)
         self._rows = aligned_rows(0)
         self._visible = 0

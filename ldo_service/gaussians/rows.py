@@ -5,6 +5,8 @@ import numpy as np
 from ldo_service.geometry import se3
 from ldo_service.kernels import _motion
 
+# Number of rows that are copied at a time, so that the copy stays in the CPU cache.
+_ROWS_AT_ONCE = 4096
 # Floats of a row: mean 3, log scale 3, quaternion wxyz 4, opacity logit, rgb 3, 2 unused.
 ROW = 16
 
@@ -14,6 +16,21 @@ def aligned_rows(capacity: int) -> np.ndarray:
     memory = np.zeros(capacity * ROW + 16, np.float32)
     skip = (-memory.ctypes.data % 64) // 4
     return memory[skip : skip + capacity * ROW].reshape(capacity, ROW)
+
+
+def keep_rows(array: np.ndarray, first: int, kept: np.ndarray) -> None:
+    """Move some rows of an array together, in place: row `kept[i]` becomes row `first + i`.
+
+    No copy of the whole array is made. The rows after the last moved one stay as they are.
+
+    Args:
+        array: Array [N, ...].
+        first: Number of the first row that is overwritten.
+        kept: Numbers of the rows to move, [M] int64, ascending, the first at least `first`.
+    """
+    for start in range(0, len(kept), _ROWS_AT_ONCE):
+        part = kept[start : start + _ROWS_AT_ONCE]
+        array[first + start : first + start + len(part)] = array[part]
 
 
 def transform_rows(rows: np.ndarray, T_new_old: np.ndarray) -> np.ndarray:

@@ -38,8 +38,9 @@ class RecordTable:
 
     def row(self, id_: int) -> int | None:
         """Return the row number of an id, or None if the id is unknown."""
-        row = int(np.searchsorted(self.ids, id_))
-        return row if row < self._count and self.ids[row] == id_ else None
+        ids = self.ids
+        row = int(ids.searchsorted(id_))
+        return row if row < self._count and ids[row] == id_ else None
 
     def rows(self, ids: Iterable[int]) -> np.ndarray:
         """Return the row number of each known id in `ids`, in the order of `ids`."""

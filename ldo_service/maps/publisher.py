@@ -295,4 +295,7 @@ class ObjectPublisher:
 
 def _to_bytes(image: np.ndarray) -> np.ndarray:
     """Convert an image from 0..1 float to 0..255 uint8."""
-    return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+    scaled = np.clip(image, 0.0, 1.0)
+    scaled *= 255.0
+    scaled += 0.5
+    return scaled.astype(np.uint8)

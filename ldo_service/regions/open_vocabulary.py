@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import cv2
 import numpy as np
 
 from ldo_service.detection.vocabulary import Vocabulary, normalized
@@ -125,7 +126,7 @@ class OpenVocabularyLabeling:
         """
         config, depth_m, camera = self.config.trigger, view.depth_m, view.camera
         labels = [vocabulary.name(int(label)) for label in detections.labels]
-        color = np.ascontiguousarray(view.color.transpose(1, 2, 0))
+        color = np.asarray(cv2.merge([*view.color]))
         shown = segment_geometry(color, depth_m, camera, config.segments)
         found = regions_of_image(shown, depth_m.shape, config)
         room = [one.part for one in shown if one.kind == "room"]

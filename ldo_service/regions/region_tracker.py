@@ -102,7 +102,8 @@ class RegionTracker:
             region = merge_observation(region, observation, config.max_box_votes)
             if candidate.score < config.settled:
                 args = keyframe, color, depth_m, camera, candidate.box_px, candidate.part
-                region = self._with_view(region, observation, region_view(*args, config.view))
+                view = region_view(*args, config.view, self._min_quality(region))
+                region = self._with_view(region, observation, view)
             self._keep(region)
             observed.append((region.id, candidate))
         for candidate in named:
@@ -289,11 +290,21 @@ class RegionTracker:
         self._next_id += 1
         return Region(self._next_id - 1, seen.keyframe, seen.box_px, seen)
 
+    def _min_quality(self, region: Region) -> float:
+        """Return the minimum quality of a new view that a region would store, 0..1.
+
+        If the region has `config.views` views, a new view must be better than the worst of them.
+        """
+        config, views = self.config, region.views
+        if len(views) < config.views:
+            return config.min_quality
+        return max(config.min_quality, float(np.nextafter(views[-1].quality, np.inf)))
+
     def _with_view(
-        self, region: Region, observation: RegionObservation, view: RegionView
+        self, region: Region, observation: RegionObservation, view: RegionView | None
     ) -> Region:
-        """Return the region with a view added; unchanged if the view is below min_quality."""
-        if view.quality < self.config.min_quality:
+        """Return the region with a view added; unchanged if there is no view."""
+        if view is None:
             return region
         views = sorted((*region.views, view), key=lambda view: -view.quality)
         best = observation if views[0] is view else region.best

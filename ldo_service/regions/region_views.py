@@ -8,6 +8,7 @@ import numpy as np
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, codecs
 from ldo_service.geometry.codecs import shrunk
+from ldo_service.kernels import _facing
 
 from .foreground import Foreground, pixels_of
 
@@ -65,10 +66,13 @@ def region_view(
     box_px: np.ndarray,
     part: Foreground,
     config: ViewConfig,
-) -> RegionView:
+    min_quality: float = 0.0,
+) -> RegionView | None:
     """Crop the view of a region from a keyframe, and rate the quality of the view.
 
-    The quality is the product of the size, border, sharpness and facing factors.
+    The quality is the product of the size, border, sharpness and facing factors. No factor exceeds
+    1. The function therefore stops as soon as the product of the known factors is below
+    `min_quality`.
 
     Args:
         keyframe: Id of the keyframe.
@@ -78,17 +82,24 @@ def region_view(
         box_px: Box of the region, [4], x0 y0 x1 y1, pixels.
         part: Mask of the region.
         config: Settings.
+        min_quality: Minimum quality of the view, 0..1.
+
+    Returns:
+        The view; None if its quality is below `min_quality`.
     """
+    quality = size_factor(box_px, config) * border_factor(box_px, depth_m.shape, config)
+    if quality < min_quality:
+        return None
     x0, y0, x1, y1 = (float(v) for v in box_px)
     margin = config.context * np.array([x1 - x0, y1 - y0])
     grown = np.array([*(box_px[:2] - margin), *(box_px[2:] + margin)])
     crop = shrunk(color[pixels_of(grown, depth_m.shape)], config.side_px)
-    quality = (
-        size_factor(box_px, config)
-        * border_factor(box_px, depth_m.shape, config)
-        * sharpness_factor(crop, config)
-        * facing_factor(depth_m, camera, part, config)
-    )
+    quality *= sharpness_factor(crop, config)
+    if quality < min_quality:
+        return None
+    quality *= facing_factor(depth_m, camera, part, config)
+    if quality < min_quality:
+        return None
     height, width = crop.shape[:2]
     jpeg = codecs.encode_jpeg(crop)
     return RegionView(keyframe, (x0, y0, x1, y1), float(quality), width, height, jpeg)
@@ -141,7 +152,9 @@ def facing_factor(
     """Return the quality factor for how directly the camera faces the surface of a region.
 
     The factor is `min_factor + (1 - min_factor) c`, where c is the mean cosine between the normals
-    of the region and the viewing rays. If no normal is known, the factor is `min_factor`.
+    of the region and the viewing rays. If no normal is known, the factor is `min_factor`. The
+    kernel is `kernels/facing.cpp`; its NumPy reference implementation is
+    `tests/reference/facing.py`.
 
     Args:
         depth_m: Depth, [H, W], meters; 0 where unknown.
@@ -153,17 +166,16 @@ def facing_factor(
     if min(height, width) < 3 or not part.mask.any():
         return config.min_factor
     rows, columns = part.row + np.arange(height), part.column + np.arange(width)
-    z = depth_m[rows[:, None], columns].astype(np.float64)
-    # The ray of a pixel is (ray_x, ray_y, 1). One array per coordinate is faster than vectors.
-    ray_x = camera.rays_at(columns, 0.0)[:, 0]
-    ray_y = camera.rays_at(0.0, rows)[:, None, 1]
-    x, y = ray_x * z, ray_y * z
-    x_u, y_u, z_u = (np.gradient(along, axis=1) for along in (x, y, z))
-    x_v, y_v, z_v = (np.gradient(along, axis=0) for along in (x, y, z))
-    n_x, n_y, n_z = y_u * z_v - z_u * y_v, z_u * x_v - x_u * z_v, x_u * y_v - y_u * x_v
-    lengths = np.sqrt(n_x * n_x + n_y * n_y + n_z * n_z) * np.sqrt(ray_x**2 + ray_y**2 + 1.0)
-    usable = part.mask & (z > 0) & (lengths > 0)
-    if not usable.any():
+    z = depth_m[rows[0] : rows[0] + height, columns[0] : columns[0] + width]
+    cosines = np.empty(height * width)
+    count = _facing.facing_cosines(
+        np.ascontiguousarray(z, np.float32),
+        np.ascontiguousarray(camera.rays_at(columns, 0.0)[:, 0]),
+        np.ascontiguousarray(camera.rays_at(0.0, rows)[:, 1]),
+        np.ascontiguousarray(part.mask).view(np.uint8),
+        cosines,
+    )
+    if count == 0:
         return config.min_factor
-    cosines = np.abs((n_x * ray_x + n_y * ray_y + n_z)[usable]) / lengths[usable]
-    return config.min_factor + (1 - config.min_factor) * float(cosines.mean())
+    mean = float(cosines[:count].mean())
+    return config.min_factor + (1 - config.min_factor) * mean

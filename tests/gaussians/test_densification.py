@@ -7,7 +7,14 @@ from ldo_service.datasets import open_sequence
 from ldo_service.errors import ConfigError
 from ldo_service.evaluation import views
 from ldo_service.gaussians import DensificationConfig, GaussianMap, densify, render
-from ldo_service.gaussians.densification import with_small_holes_filled
+from ldo_service.gaussians.cells import QuadtreeCells, quadtree
+from ldo_service.gaussians.densification import (
+    correct_colors,
+    densification_mask,
+    tiles_of,
+    with_small_holes_filled,
+)
+from ldo_service.gaussians.renderer import RenderMemory
 from ldo_service.geometry import Camera, RgbdFrame, se3
 
 CAMERA = Camera(120, 88, 100.0, 100.0, 59.5, 43.5)
@@ -48,6 +55,44 @@ def with_box(frame: RgbdFrame, columns: slice) -> RgbdFrame:
     depth_m, color = frame.depth_m.copy(), frame.color.copy()
     depth_m[30:50, columns], color[30:50, columns] = 1.0, (255, 0, 0)
     return RgbdFrame(color, depth_m, CAMERA)
+
+
+@pytest.mark.parametrize("size", [1, 4, 16, 32])
+def test_tiles_of_cells_are_those_of_their_pixels(size: int) -> None:
+    height, width, rng = 96, 160, np.random.default_rng(size)
+    chosen = rng.uniform(size=(height // size, width // size)) < 0.0004 * size**2
+    chosen[-1, -1] = True
+    row, column = (size * place for place in np.nonzero(chosen))
+    tiles = tiles_of(QuadtreeCells(row, column, np.full(len(row), size)), height, width)
+    pixels = chosen.repeat(size, axis=0).repeat(size, axis=1)
+    expected = pixels.reshape(height // 16, 16, width // 16, 16).any(axis=(1, 3))
+    np.testing.assert_array_equal(tiles, expected)
+    assert not tiles.all()
+
+
+def test_colors_are_corrected_by_a_rendering_of_the_whole_image() -> None:
+    """A map of one half of the image gets the other half, in tiles with and without cells."""
+    frame, gaussians = corner_of_a_room(), GaussianMap()
+    half = np.zeros(frame.depth_m.shape, bool)
+    half[:, 60:] = True
+    uncorrected = DensificationConfig(color_steps=0)
+    densify(gaussians, frame, T_MAP_CAMERA, keyframe=0, config=uncorrected, ignore_mask=half)
+    before = view(gaussians, T_MAP_CAMERA)
+    ids = densify(gaussians, frame, T_MAP_CAMERA, keyframe=1, config=uncorrected)
+    shown, first = view(gaussians, T_MAP_CAMERA), len(gaussians) - len(ids)
+    depth_m = with_small_holes_filled(frame.depth_m, uncorrected.hole_px)
+    wanted = densification_mask(frame, before, uncorrected) & (depth_m > 0)
+    cells = quadtree(
+        frame.color, depth_m, wanted, coarsest_px=4, max_contrast=0.3, max_depth_step=0.05
+    )
+    expected = gaussians.colors[first:].copy()
+    correct_colors(expected, cells, frame, shown.color, uncorrected.max_color_step)
+
+    again = GaussianMap()
+    densify(again, frame, T_MAP_CAMERA, keyframe=0, config=uncorrected, ignore_mask=half)
+    densify(again, frame, T_MAP_CAMERA, keyframe=1, memory=RenderMemory())
+    np.testing.assert_array_equal(again.colors[first:], expected)
+    assert not tiles_of(cells, *wanted.shape).all()
 
 
 def test_densified_frame_is_rendered_as_observed() -> None:

@@ -15,6 +15,21 @@ def test_exposure_matches_its_matrix() -> None:
     np.testing.assert_allclose(rendered[0, 0], [0.7, 0.4, 0.1], atol=1e-6)
 
 
+def test_exposure_is_applied_to_each_channel_bit_for_bit() -> None:
+    exposure = Exposure.of(np.array([[1.3, 0.8, 0.05], [-0.1, 0.2, 0.05]]))
+    color = np.random.default_rng(1).uniform(-0.1, 1.1, (7, 5, 3)).astype(np.float32)
+    expected = (exposure.gain * color + exposure.bias).clip(0, 1)
+    np.testing.assert_array_equal(exposure.applied(color), expected)
+
+
+def test_exposure_is_removed_from_an_image_bit_for_bit() -> None:
+    exposure = Exposure.of(np.array([[1.3, 0.8, 0.05], [-0.1, 0.2, 0.05]]))
+    image = np.random.default_rng(1).integers(0, 256, (40, 50, 3)).astype(np.uint8)
+    color = exposure.removed(image * np.float32(1 / 255))
+    expected = (255 * color + 0.5).astype(np.uint8)
+    np.testing.assert_array_equal(exposure.removed_from_image(image), expected)
+
+
 def test_fit_recovers_the_applied_exposure() -> None:
     color = np.random.default_rng(0).uniform(0.2, 0.6, (20, 20, 3))
     true_exposure = Exposure.of(np.array([[1.3, 0.8, 1.0], [-0.1, 0.2, 0.05]]))

@@ -419,10 +419,36 @@ def test_crop_includes_a_margin_around_the_region() -> None:
     depth_m = np.full(SHAPE, 2.0, np.float32)
     one = proposal()
     view = region_view(4, color, depth_m, CAMERA, one.box_px, one.part, ViewConfig())
+    assert view is not None
     assert (view.width, view.height, view.keyframe) == (40, 40, 4)
     crop = codecs.decode_color("jpeg", view.width, view.height, memoryview(view.jpeg))
     assert crop[19, 19, 0] > 200
     assert crop[1, 1].max() < 60
+
+
+def test_view_below_the_minimum_quality_is_not_made() -> None:
+    depth_m, one = np.full(SHAPE, 2.0, np.float32), proposal()
+    args = 4, COLOR, depth_m, CAMERA, one.box_px, one.part, ViewConfig()
+    view = region_view(*args)
+    assert view is not None
+    same = region_view(*args, view.quality)
+    assert same is not None
+    assert (same.quality, same.jpeg) == (view.quality, view.jpeg)
+    assert region_view(*args, float(np.nextafter(view.quality, 1))) is None
+
+
+def test_crop_of_a_view_that_is_not_stored_is_not_encoded(monkeypatch: pytest.MonkeyPatch) -> None:
+    encoded: list[np.ndarray] = []
+    encode = codecs.encode_jpeg
+    monkeypatch.setattr(codecs, "encode_jpeg", lambda crop: encoded.append(crop) or encode(crop))
+    sequence = KeyframeSequence()
+    for _ in range(CONFIG.views + 2):  # The last two views are no better than the stored ones.
+        sequence.observe(proposal())
+    sequence.observe(proposal(side=34))
+    region = sequence.regions.get(0)
+    assert region is not None
+    assert [view.keyframe for view in region.views] == [5, 0, 1]
+    assert len(encoded) == CONFIG.views + 1
 
 
 def test_views_clipped_by_the_image_have_lower_quality() -> None:
