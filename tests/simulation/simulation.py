@@ -63,6 +63,8 @@ class Report:
 class Simulation:
     """One run."""
 
+    alive_within_s = ALIVE_WITHIN_S
+
     def __init__(
         self, loop: VirtualLoop, seed: int, only: Sequence[str] = (), remote: Sequence[str] = ()
     ) -> None:
@@ -179,7 +181,7 @@ class Simulation:
             if not stuck:
                 self.report.recovery_s = after_s
                 break
-            if after_s > ALIVE_WITHIN_S:
+            if after_s > self.alive_within_s:
                 self._violation(f"{after_s:.1f} s after the last fault: {'; '.join(stuck)}")
                 break
         recovering.cancel()

@@ -29,12 +29,16 @@ LOSS, DELAY_S = (0.01, 0.2), (0.05, 0.5)
 BETWEEN_S, CUT_S = (2.0, 30.0), (1.0, 40.0)  # Time between two partitions, and duration of one.
 WAYS = ((Way.OUT,), (Way.BACK,), (Way.OUT, Way.BACK))
 RESUMED_WITHIN_S = 5.0
+# A link first passes on the messages that waited, up to 140 keyframes of the optimizer: 11 s.
+ALIVE_WITHIN_S = 15.0
 MAX_POSE_GAP_S = 2.0  # The camera sends a frame every 0.6 s.
 POSES = data_key("pose/tracked")
 
 
 class TwoHosts(Simulation):
     """One run with two hosts."""
+
+    alive_within_s = ALIVE_WITHIN_S
 
     def __init__(self, loop: VirtualLoop, seed: int, max_duration_s: float) -> None:
         self._rng, self._max_duration_s = random.Random(f"{seed} hosts"), max_duration_s
