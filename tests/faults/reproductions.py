@@ -123,7 +123,7 @@ def header(seq: int, source: str = "outside", epoch: int = 1) -> bytes:
 
 # --- stages -----------------------------------------------------------------------------------
 class Counter(Actor):
-    """Actor that counts messages, and fails at messages and after saves as it is told."""
+    """Actor that counts messages, and fails at some messages and after some saves."""
 
     name = "counter"
     inputs = (In(LABEL_ADD, Latest(32)),)
@@ -203,7 +203,7 @@ def error_after_save() -> bool:
 
 
 def damaged_state() -> bool:
-    """After an exception, an actor with a damaged state continues empty and reports ready."""
+    """An actor with a damaged state continues empty after an exception, and reports ready."""
     with tempfile.TemporaryDirectory() as folder:
         state, count, ended = asyncio.run(counted(["good"] * 5 + ["damage"], Path(folder)))
         return state == "ready" and count == 0 and not ended
@@ -444,7 +444,7 @@ def far_prior() -> bool:
     """Poses of another odometry at 1e100 m make the tracker fail."""
     messages, stamp_ns, turn = [], 950_000_000, 0
     for frame in frames(16, 8):
-        # With other stamps or coordinates, the rounding errors of the poses may cancel.
+        # The rounding errors of the poses cancel at other stamps or coordinates.
         frame["stamp_ns"] += 66_000_000
         while stamp_ns < frame["stamp_ns"] + 400_000_000:
             quaternion = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0))[turn % 2]
