@@ -139,19 +139,14 @@ def reliable_label_mask(labels: np.ndarray, top: np.ndarray, least: float) -> np
 
     Args:
         labels: Label rows of the Gaussians, [N, 32] uint8, see `gaussian_labels.ROW`.
-        top: Row of the Gaussian that contributes most to each pixel, [H, W]; -1 if no Gaussian
-            contributes.
+        top: Row of the Gaussian that contributes most to each pixel, [H, W]; -1 if there is none.
         least: Minimum probability of the label.
     """
-    # A Gaussian covers several pixels. Its label is therefore read once, and not once per pixel.
-    # The last value of both masks belongs to no Gaussian: it is for pixels with top = -1.
-    is_on_top = np.zeros(len(labels) + 1, bool)
-    is_on_top[top] = True
-    on_top = np.flatnonzero(is_on_top[:-1])
-    rows, is_reliable = labels[on_top], np.zeros(len(labels) + 1, bool)
-    is_reliable[on_top] = fields(rows)["weights"][:, 0] >= least
-    is_reliable[on_top] &= top_labels(rows) != BACKGROUND
-    return is_reliable[top]
+    out = np.zeros(len(labels) + 1, bool)  # The last value is for top = -1.
+    out[top] = True
+    rows = labels[shown := np.flatnonzero(out[:-1])]
+    out[shown] = (fields(rows)["weights"][:, 0] >= least) & (top_labels(rows) != BACKGROUND)
+    return out[top] & (top >= 0)
 
 
 def label_image(

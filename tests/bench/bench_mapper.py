@@ -22,7 +22,7 @@ from ldo_service.runtime.step import produce
 from ldo_service.schemas import DetectionBoxes, Keyframe
 from ldo_service.schemas.topics import KEYFRAME_NEW
 
-WAITING = 9  # Keyframes that wait, according to the situation that the mapper is told.
+WAITING = 9  # Number of waiting keyframes that is reported to the mapper.
 
 
 def main() -> None:
