@@ -80,6 +80,19 @@ def test_gpu_that_fails_the_self_test_is_not_timed(monkeypatch: pytest.MonkeyPat
         device_iteration.device_times(ARRAYS, 30, bench_camera(16, 16), 1)
 
 
+def test_program_maps_no_source_if_the_gpu_is_wrong(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise DeviceError("the loss differs.")
+
+    monkeypatch.setattr(device_iteration, "run_self_test", fail)
+    monkeypatch.setattr(bench_gpu, "report_source", lambda *_: pytest.fail("it was timed"))
+    monkeypatch.setattr("sys.argv", ["bench_gpu", "synthetic:room"])
+    assert bench_gpu.main() == 1
+    assert capsys.readouterr().out.endswith("the loss differs.\n")
+
+
 @pytest.mark.slow
 def test_program_prints_the_stages(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
