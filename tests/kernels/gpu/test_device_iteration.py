@@ -9,7 +9,9 @@ import pytest
 
 from ldo_service.errors import DeviceError
 from ldo_service.evaluation.iteration import bench_camera
+from ldo_service.gaussians.map_builder_config import MapBuilderConfig
 from ldo_service.kernels.gpu.device import Gpu
+from ldo_service.runs.map_benchmark import HeldOutErrors, MapMeasurement
 from tests.bench import bench_gpu
 from tests.commands.test_cli import ldo
 from tests.kernels.gpu.scenes import ARRAYS, device_iteration, equation_sums, plane_rendering
@@ -80,6 +82,19 @@ def test_gpu_that_fails_the_self_test_is_not_timed(monkeypatch: pytest.MonkeyPat
         device_iteration.device_times(ARRAYS, 30, bench_camera(16, 16), 1)
 
 
+def test_program_maps_no_source_if_the_gpu_is_wrong(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise DeviceError("the loss differs.")
+
+    monkeypatch.setattr(device_iteration, "run_self_test", fail)
+    monkeypatch.setattr(bench_gpu, "report_source", lambda *_: pytest.fail("it was timed"))
+    monkeypatch.setattr("sys.argv", ["bench_gpu", "synthetic:room"])
+    assert bench_gpu.main() == 1
+    assert capsys.readouterr().out.endswith("the loss differs.\n")
+
+
 @pytest.mark.slow
 def test_program_prints_the_stages(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -97,3 +112,49 @@ def test_equal_time_gives_the_saved_time_to_the_iterations() -> None:
     cpu = SimpleNamespace(cpu_ms={"all": 500.0, "iterations": 400.0})
     gpu = SimpleNamespace(cpu_ms={"all": 140.0, "iterations": 40.0}, effort=12)
     assert bench_gpu.equal_time_effort(cpu, gpu) == 120  # type: ignore[arg-type]
+
+
+class TimedSource:
+    """Tracked source of two keyframes, whose iterations are ten times faster on a GPU."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[str, int]] = []
+
+    def record(self, *_: object) -> "TimedSource":
+        return self
+
+    def measure(self, config: MapBuilderConfig, effort: int) -> MapMeasurement:
+        device = config.optimizer.device
+        self.calls.append((device, effort))
+        iterations_ms = effort * (10.0 if device == "cpu" else 1.0)
+        psnr_db = 20.0 + effort / 10
+        return MapMeasurement(
+            source="room",
+            frames=10,
+            keyframes=2,
+            effort=effort,
+            iterations=2 * effort,
+            gaussians=100,
+            fps=10_000 / (2 * (iterations_ms + 20)),
+            cpu_ms={"iterations": iterations_ms, "all": iterations_ms + 20},
+            online=HeldOutErrors(
+                mean_psnr_db=psnr_db,
+                median_psnr_db=psnr_db,
+                mean_depth_l1_cm=1.0,
+                median_depth_l1_cm=1.0,
+            ),
+        )
+
+
+def test_source_is_mapped_with_equal_iterations_and_in_equal_time(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = TimedSource()
+    monkeypatch.setattr(bench_gpu, "TrackedSource", source)
+    bench_gpu.report_source("synthetic:room", 10, 12, tmp_path)
+    assert source.calls == [("cpu", 12), ("cuda", 12), ("cuda", 120)]
+    _, cpu, equal_iterations, equal_time = capsys.readouterr().out.splitlines()
+    assert "CPU: 35.71 FPS, 24 iterations, 100 Gaussians, 21.20 dB" in cpu
+    assert "GPU, equal iterations: 156.25 FPS" in equal_iterations
+    assert equal_iterations.endswith("(4.4x)")
+    assert "GPU, equal time: 35.71 FPS, 240 iterations, 100 Gaussians, 32.00 dB" in equal_time
