@@ -60,7 +60,6 @@ class MapBuilder:
         self.views = KeyframeViews(KeyframeStore(folder and folder / "images", self.config.store))
         self.files = MapFiles(self.offloaded, self.views.store)
         self._threads = threads
-        self._renderer = KeyframeRenderer(self.views, threads)
         self._confirmation = Confirmation(self.views.store, self.config.pruning, self.config.seed)
         self.fitting = Fitting(
             self.config.optimizer,
@@ -70,6 +69,7 @@ class MapBuilder:
             seed=self.config.seed,
             threads=threads,
         )
+        self._renderer = KeyframeRenderer(self.views, self.fitting)
         self._log = ChangeLog()
         self._published = PublishedPoses(self.config.refined_m, self.config.refined_rad)
         self._newest: int | None = None
