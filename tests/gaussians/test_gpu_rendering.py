@@ -23,7 +23,7 @@ from ldo_service.geometry import Camera, se3
 from ldo_service.kernels.gpu.arrays import HostArray
 from ldo_service.kernels.gpu.device import Gpu
 from tests.gaussians.conftest import FEW, halved, window
-from tests.kernels.gpu.scenes import ARRAYS, FilledArrays, plane_rendering
+from tests.kernels.gpu.scenes import ARRAYS, SCENES, FilledArrays, plane_rendering
 
 CONFIG = GaussianOptimizerConfig()
 SIZE = 32
@@ -105,6 +105,16 @@ def test_rendering_equals_that_of_the_cpu(scene: Scene) -> None:
     assert_same_images(plain, wanted)
     assert plain.contributions is None
     assert on_gpu.device.device == "cuda"
+
+
+def test_hidden_gaussians_contribute_nothing(scene: Scene) -> None:
+    cloud = SCENES["cloud"]
+    scene.gaussians, scene.camera, scene.pose = GaussianMap(), cloud.camera, np.eye(4)
+    scene.gaussians.add(cloud.rows, 0)
+    wanted, got = scene.rendered(GaussianOptimizer(CONFIG)), scene.rendered(optimizer_on(ARRAYS))
+    assert_same_rendering(got, wanted, rtol=2e-6)
+    assert got.contributions is not None
+    assert got.contributions.weights.min() > 0
 
 
 def test_empty_map_is_rendered(scene: Scene) -> None:
@@ -201,12 +211,14 @@ def test_builder_renders_views_and_contributions_on_the_gpu(
 
 
 def test_keyframe_is_added_although_its_first_rendering_fails(
-    room: Sequence, tmp_path: Path, with_gpu: Callable
+    room: Sequence, tmp_path: Path, with_gpu: Callable, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with_gpu(CountingArrays(2))  # The first keyframe needs two downloads.
+    # The first keyframe needs two downloads for its rendering, and one for its empty plan.
+    with_gpu(CountingArrays(3))
     builder = builder_on("cuda", room, tmp_path / "gpu")
     on_cpu = builder_on("cpu", room, tmp_path / "cpu")
     assert builder.metrics()["device_failed"] == 1
+    assert "rendering of a view failed" in caplog.text
     np.testing.assert_array_equal(builder.gaussians.rows, on_cpu.gaussians.rows)
     assert list(builder.views.store.keyframes()) == [0, 4]
 
