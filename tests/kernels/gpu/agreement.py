@@ -30,8 +30,8 @@ LIMITS = {
     "median of rows after ten iterations": 1e-5,
     "loss in ten iterations": 1e-4,
     "exposure after ten iterations": 1e-4,
-    "motion of poses in ten iterations": 1e-4,
-    "moments of poses in ten iterations": 1e-3,
+    "motion of poses in ten iterations": 5e-6,
+    "moments of poses in ten iterations": 2e-5,
 }
 measured: dict[str, list[tuple[float, str]]] = {}
 
