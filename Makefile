@@ -26,7 +26,7 @@ bench: .venv/tests  ## run the benchmarks; docs/benchmarks has a page per questi
 gpu-check: .venv/tests  ## interpret and compile the GPU kernels; it needs no GPU and no torch
 	$(BIN)/python -m pip install --quiet --group gpu-check
 	LDO_ISA=baseline TRITON_INTERPRET=1 $(BIN)/python -m pytest -q -m "" -n auto --dist worksteal \
-		tests/kernels/gpu tests/gaussians/test_gpu_backend.py tests/gaussians/test_gpu_self_test.py \
+		tests/kernels/gpu tests/gaussians/test_gpu_*.py \
 		tests/gaussians/test_device_fallback.py tests/tracking/test_alignment_self_test.py \
 		tests/tracking/test_aligner.py tests/commands/test_doctor.py $(ARGS)
 	$(BIN)/python -m tests.kernels.gpu.cubins

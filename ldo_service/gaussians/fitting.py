@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 
 from ldo_service.errors import ConfigError, named
+from ldo_service.geometry import Camera
 from ldo_service.kernels.gpu.device import DeviceChoice
 
 from .keyframe_store import KeyframeViews
 from .model import GaussianMap
 from .optimizer import GaussianOptimizer, GaussianOptimizerConfig
 from .plan_attempt import Observer
+from .renderer import Rendering
 from .training_views import TrainingView, covisibility_ratio, sample_training_views, sampled_surface
 
 # Number of random draws per needed keyframe. The additional draws replace drawn keyframes that may
@@ -88,8 +90,19 @@ class Fitting:
 
     @property
     def device(self) -> DeviceChoice:
-        """Device of the iterations."""
+        """Device of the iterations and of the renderings."""
         return self._optimizer.device
+
+    def render(
+        self,
+        gaussians: GaussianMap,
+        camera: Camera,
+        T_map_camera: np.ndarray,
+        *,
+        contributions: bool = False,
+    ) -> Rendering:
+        """Render the map on the device of the iterations; see `GaussianOptimizer.render`."""
+        return self._optimizer.render(gaussians, camera, T_map_camera, contributions=contributions)
 
     def forget_view(self, keyframe: int) -> None:
         """Drop the Adam moments that the Gaussian optimizer stores for the pose of a keyframe."""

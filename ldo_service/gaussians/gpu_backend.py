@@ -9,8 +9,8 @@ from weakref import ref
 import numpy as np
 
 from ldo_service.errors import DeviceError
-from ldo_service.geometry import se3
-from ldo_service.kernels.gpu import descent, frame_loss, plane_rendering
+from ldo_service.geometry import Camera, se3
+from ldo_service.kernels.gpu import descent, frame_loss, plane_rendering, view_rendering
 from ldo_service.kernels.gpu.arrays import Arrays
 from ldo_service.kernels.gpu.device import device_errors
 
@@ -20,7 +20,7 @@ from .gpu_mirror import GaussianMirror
 from .loss import ImageLoss, LossWeights
 from .model import GaussianMap
 from .optimizer_backend import CpuBackend, ShapeLimits
-from .renderer import VisibleGaussians
+from .renderer import Contributions, Rendering, VisibleGaussians, require_undistorted
 from .training_views import TrainingView
 
 # Number of images that stay on the device, at 8 bytes a pixel. A keyframe counts twice if it is
@@ -201,6 +201,45 @@ class GpuBackend:
             (camera.fx, camera.fy, camera.cx, camera.cy),
             ImageBlocks.of(image.color, image.mask),
         )
+
+    def render_view(
+        self,
+        gaussians: GaussianMap,
+        camera: Camera,
+        T_map_camera: np.ndarray,
+        *,
+        contributions: bool,
+    ) -> Rendering:
+        require_undistorted(camera)
+        with device_errors("rendering of a view"):
+            return self._render_view(gaussians.rows, camera, T_map_camera, contributions)
+
+    def _render_view(
+        self, rows: np.ndarray, camera: Camera, T_map_camera: np.ndarray, contributions: bool
+    ) -> Rendering:
+        # The mirror stays as it is: its update would match the moments to the map, and the next
+        # plan would then depend on the renderings before it.
+        arrays, intrinsics = self._arrays, (camera.fx, camera.fy, camera.cx, camera.cy)
+        rendering = plane_rendering.render(
+            arrays,
+            arrays.upload(rows),
+            len(rows),
+            plane_rendering.view_of(se3.inverse(T_map_camera), intrinsics),
+            camera.width,
+            camera.height,
+        )
+        planes = arrays.download(rendering.planes)
+        median_depth_m = arrays.download(view_rendering.median_depth(arrays, rendering))
+        color = np.ascontiguousarray(planes[:3].transpose(1, 2, 0))
+        made_by = self._contributions(rendering) if contributions else None
+        return Rendering(color, planes[3], median_depth_m, planes[4], made_by)
+
+    def _contributions(self, rendering: plane_rendering.PlaneRendering) -> Contributions:
+        arrays, found = self._arrays, view_rendering.contributions_to(self._arrays, rendering)
+        indices = arrays.download(rendering.lists.visible).astype(np.uint32)
+        weights = arrays.download(found.weights)
+        is_seen = weights > 0
+        return Contributions(indices[is_seen], weights[is_seen], arrays.download(found.top))
 
     def steps(self, gaussians: GaussianMap) -> np.ndarray:
         return self._adam.steps(gaussians)

@@ -1,6 +1,8 @@
-"""Self-test of the GPU backend: iterations on a small scene, compared with those of the CPU."""
+"""Self-test of the GPU backend: iterations and a rendering of a small scene, as on the CPU."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -32,10 +34,11 @@ COLUMNS["color"] = (11, 14)
 # largest ones that the interpreter of Triton gave on this scene, compared with all three
 # instruction sets of the CPU, are below a fifth of each limit.
 TOLERANCE = {"loss": 1e-5, "weights": 1e-6, "exposure": 1e-6, "moments": 2e-5, "pose": 1e-5}
-TOLERANCE["step"] = 2e-6
-# Largest fraction of the Gaussians that rounding makes visible on one of the devices alone. None of
-# the self-test is.
+TOLERANCE |= {"step": 2e-6, "color": 1e-6, "depth": 1e-6, "opacity": 1e-6}
+# Largest fraction of the Gaussians that rounding makes visible on one of the devices alone, and of
+# the pixels with another Gaussian on top or at the median depth. The self-test has none of them.
 MAX_BORDERLINE = 1e-3
+SAME_DEPTH = 1e-5  # Median depths of the same Gaussian differ less, relative to the depth.
 # A derivative below this fraction of the largest one in its column may have either sign, and the
 # first step of Adam depends on the sign alone. Its step is not compared.
 CLEAR_RATIO = 1e-2
@@ -43,7 +46,7 @@ CLEAR_RATIO = 1e-2
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Outcome:
-    """Results of one iteration as arrays by name; rows have the order of the map."""
+    """Results of one iteration or rendering, by name; rows have the order of the map."""
 
     values: dict[str, np.ndarray]
 
@@ -54,8 +57,11 @@ class Outcome:
         )
 
 
+Run = Callable[[OptimizerBackend], Outcome]
+
+
 def run_self_test(arrays: Arrays, repeats: int = REPEATS) -> None:
-    """Run iterations on the CPU once and on the GPU several times, and compare the results.
+    """Iterate and render on the CPU once and on the GPU several times, and compare the results.
 
     Args:
         arrays: Array operations on the GPU.
@@ -65,14 +71,19 @@ def run_self_test(arrays: Arrays, repeats: int = REPEATS) -> None:
         DeviceError: The GPU fails, its results differ from those of the CPU, or its results differ
             between two runs.
     """
-    scene = _scene()
-    for is_half in (False, True):
-        wanted = iterate(CpuBackend(ADAM, WEIGHTS, LIMITS), *scene, is_half)
+    rows, view = _scene()
+    runs: list[tuple[Run, Callable[[Outcome, Outcome], None]]] = [
+        (partial(iterate, rows=rows, view=view, is_half=False), require_equal),
+        (partial(iterate, rows=rows, view=view, is_half=True), require_equal),
+        (partial(render_view, rows=rows, view=view), require_equal_view),
+    ]
+    for run, require in runs:
+        wanted = run(CpuBackend(ADAM, WEIGHTS, LIMITS))
         first: Outcome | None = None
         for _ in range(repeats):
-            got = iterate(GpuBackend(arrays, ADAM, WEIGHTS, LIMITS), *scene, is_half)
+            got = run(GpuBackend(arrays, ADAM, WEIGHTS, LIMITS))
             if first is None:
-                require_equal(got, wanted)
+                require(got, wanted)
             elif not got.same_bits(first):
                 raise DeviceError(
                     "the results of the self-test differ between two repetitions. Use the CPU."
@@ -142,7 +153,49 @@ def require_equal(got: Outcome, wanted: Outcome) -> None:
             f"{changed:.1%} of the Gaussians are visible on the GPU but not on the CPU, or the "
             f"reverse. At most {MAX_BORDERLINE:.1%} is allowed. Use the CPU."
         )
-    for name, difference in differences(got, wanted).items():
+    _require_within_tolerance(differences(got, wanted))
+
+
+def render_view(backend: OptimizerBackend, rows: np.ndarray, view: TrainingView) -> Outcome:
+    """Render Gaussians [N, 16] at the pose of a view, and return the images and contributions."""
+    gaussians = GaussianMap(len(rows))
+    gaussians.add(rows, 0)
+    shown = backend.render_view(gaussians, view.camera, view.T_map_camera, contributions=True)
+    made_by, weights = shown.contributions, np.zeros(len(rows), np.float32)
+    assert made_by is not None
+    weights[made_by.indices] = made_by.weights
+    return Outcome(
+        {
+            "color": shown.color,
+            "depth": shown.weighted_depth_m,
+            "opacity": shown.opacity,
+            "weights": weights,
+            "median depth": shown.median_depth_m,
+            "top": made_by.top,
+        }
+    )
+
+
+def require_equal_view(got: Outcome, wanted: Outcome) -> None:
+    """Check that a rendering of a GPU equals that of the CPU, apart from rounding.
+
+    Raises:
+        DeviceError: The results differ by more than rounding explains.
+    """
+    depth_m, wanted_m = got.values["median depth"], wanted.values["median depth"]
+    is_other = ~(np.abs(depth_m - wanted_m) <= SAME_DEPTH * wanted_m)
+    is_other |= got.values["top"] != wanted.values["top"]
+    if is_other.mean() > MAX_BORDERLINE:
+        raise DeviceError(
+            f"{is_other.mean():.1%} of the pixels have another median depth or top Gaussian than "
+            f"on the CPU. At most {MAX_BORDERLINE:.1%} is allowed. Use the CPU."
+        )
+    names = "color", "depth", "opacity", "weights"
+    _require_within_tolerance({k: _relative(got.values[k], wanted.values[k]) for k in names})
+
+
+def _require_within_tolerance(differences: dict[str, float]) -> None:
+    for name, difference in differences.items():
         limit = TOLERANCE[name.partition(" ")[0]]
         if not difference <= limit:  # NaN is above every limit.
             raise DeviceError(

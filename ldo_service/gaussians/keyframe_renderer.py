@@ -2,28 +2,25 @@
 
 import numpy as np
 
-from ldo_service.geometry import Camera, se3
+from ldo_service.geometry import Camera
 
+from .fitting import Fitting
 from .keyframe_store import KeyframeViews
 from .model import GaussianMap
-from .renderer import Rendering, RenderMemory, render
+from .renderer import Rendering
 
 
 class KeyframeRenderer:
-    """Renderer of the Gaussians in memory; it caches the last rendering at a keyframe.
+    """Renderer of the Gaussians in memory; it caches the last rendering at a keyframe."""
 
-    Attributes:
-        memory: Scratch memory, which other renderings may use between two calls.
-    """
-
-    def __init__(self, views: KeyframeViews, threads: int) -> None:
+    def __init__(self, views: KeyframeViews, fitting: Fitting) -> None:
         """Create a renderer with an empty cache.
 
         Args:
             views: Cameras and poses of the keyframes.
-            threads: Threads of the renderer.
+            fitting: Fitting of the map, on the device that also renders it.
         """
-        self._views, self._threads, self.memory = views, threads, RenderMemory()
+        self._views, self._fitting = views, fitting
         # Cached rendering of one keyframe; None after a change of the map.
         self._cached: tuple[int, Rendering] | None = None
 
@@ -43,15 +40,7 @@ class KeyframeRenderer:
 
         With `contributions`, the contribution of each Gaussian is computed too; see `render`.
         """
-        return render(
-            gaussians.rows,
-            camera,
-            se3.inverse(T_map_camera),
-            bounds=gaussians.bounds,
-            memory=self.memory,
-            contributions=contributions,
-            threads=self._threads,
-        )
+        return self._fitting.render(gaussians, camera, T_map_camera, contributions=contributions)
 
     def render_keyframe(
         self, gaussians: GaussianMap, keyframe: int, *, contributions: bool = False

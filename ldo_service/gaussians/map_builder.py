@@ -23,7 +23,7 @@ from .model import GaussianBatch, GaussianMap
 from .offloading import OffloadedGaussians, iter_all_gaussians
 from .plan_attempt import Observer
 from .pruning import find_duplicates, prunable_mask
-from .renderer import Contributions, Rendering
+from .renderer import Contributions, Rendering, RenderMemory
 from .training_views import TrainingView, visible_in_mask
 from .visibility import BoundingSpheres, MaxDepthGrid, PlacedCamera, chunk_numbers, plan_offload
 
@@ -60,7 +60,6 @@ class MapBuilder:
         self.views = KeyframeViews(KeyframeStore(folder and folder / "images", self.config.store))
         self.files = MapFiles(self.offloaded, self.views.store)
         self._threads = threads
-        self._renderer = KeyframeRenderer(self.views, threads)
         self._confirmation = Confirmation(self.views.store, self.config.pruning, self.config.seed)
         self.fitting = Fitting(
             self.config.optimizer,
@@ -70,6 +69,8 @@ class MapBuilder:
             seed=self.config.seed,
             threads=threads,
         )
+        self._renderer = KeyframeRenderer(self.views, self.fitting)
+        self._insertion_memory = RenderMemory()  # Used by the rendering of new Gaussians.
         self._log = ChangeLog()
         self._published = PublishedPoses(self.config.refined_m, self.config.refined_rad)
         self._newest: int | None = None
@@ -164,7 +165,7 @@ class MapBuilder:
             self.config.insertion,
             before=before,
             ignore_mask=dynamic_mask,
-            memory=self._renderer.memory,
+            memory=self._insertion_memory,
             threads=self._threads,
         )
         self._log.mark_added(self.gaussians)

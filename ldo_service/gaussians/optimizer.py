@@ -9,7 +9,7 @@ from math import inf
 import numpy as np
 
 from ldo_service.errors import ConfigError, DeviceError, named
-from ldo_service.geometry import se3
+from ldo_service.geometry import Camera, se3
 from ldo_service.kernels.gpu.device import Device
 
 from .adam import AdamConfig
@@ -20,7 +20,7 @@ from .model import GaussianMap
 from .optimizer_backend import OptimizerBackend, ShapeLimits
 from .plan_attempt import Observer, PlanAttempt, Views
 from .pose_adam import PoseAdam
-from .renderer import VisibleGaussians
+from .renderer import Rendering, VisibleGaussians
 from .training_views import TrainingView
 
 # Effort of an iteration at half resolution, relative to one at full resolution: the ratio of their
@@ -127,7 +127,7 @@ class GaussianOptimizer:
 
     A plan is the sequence of keyframes for which `optimize` does one iteration each. The same map,
     training views and plan give bitwise equal results for any number of threads. If a GPU fails,
-    the CPU runs the current plan again, and all later plans. Not thread-safe.
+    the CPU runs the current plan or rendering again, and all later ones. Not thread-safe.
 
     Args:
         config: Settings.
@@ -135,7 +135,7 @@ class GaussianOptimizer:
         backend: Backend that runs the iterations; None to choose it by `config.device`.
 
     Attributes:
-        device: Device of the iterations, with the reason for its choice.
+        device: Device of iterations and renderings, with the reason for its choice.
     """
 
     def __init__(
@@ -216,11 +216,40 @@ class GaussianOptimizer:
         with self._begun(gaussians):
             return self._iterate(views, plan, *options, observe, is_usable)
 
+    def render(
+        self,
+        gaussians: GaussianMap,
+        camera: Camera,
+        T_map_camera: np.ndarray,
+        *,
+        contributions: bool = False,
+    ) -> Rendering:
+        """Render the map on the device of the iterations, which leaves the optimizer as it is.
+
+        Args:
+            gaussians: The map.
+            camera: Intrinsics without distortion.
+            T_map_camera: Pose of the camera, [4, 4].
+            contributions: Also compute the contributions of the Gaussians.
+
+        Raises:
+            DataError: The camera has lens distortion.
+        """
+        try:
+            return self._backend.render_view(
+                gaussians, camera, T_map_camera, contributions=contributions
+            )
+        except DeviceError as error:
+            self._continue_on_cpu(error)
+        return self._backend.render_view(
+            gaussians, camera, T_map_camera, contributions=contributions
+        )
+
     def _continue_on_cpu(self, error: DeviceError) -> None:
         self._backend, self.device = self._backend.on_cpu(), self.device.failed(error)
         log.error(
-            "mapper: %s The CPU fits the map from now on, and no keyframe is lost. Restart the "
-            "service to use the GPU again.",
+            "mapper: %s The CPU fits and renders the map from now on, and no keyframe is lost. "
+            "Restart the service to use the GPU again.",
             self.device.reason,
             exc_info=error.__cause__,
         )

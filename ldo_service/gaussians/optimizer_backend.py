@@ -6,14 +6,14 @@ from typing import Protocol
 
 import numpy as np
 
-from ldo_service.geometry import se3
+from ldo_service.geometry import Camera, se3
 
 from .adam import Adam, AdamConfig
 from .exposure import Exposure, estimate_block_exposure
 from .loss import ImageLoss, LossWeights, image_loss
 from .model import GaussianMap
 from .prepared_images import PreparedImage, PreparedImages
-from .renderer import Rasterizer, VisibleGaussians
+from .renderer import Rasterizer, Rendering, RenderMemory, VisibleGaussians, render
 from .training_views import TrainingView
 
 
@@ -40,9 +40,9 @@ class OptimizerBackend(Protocol):
     the map.
 
     Attributes:
-        can_fail: True if the methods from `begin` to `end` may raise DeviceError. After the error,
-            the map and the moments are as they were at `begin`. The results of `descend` of such a
-            backend stay valid after the next rendering.
+        can_fail: True if `render_view` and the methods from `begin` to `end` may raise DeviceError.
+            After the error, the map and the moments are as they were before the call, or at
+            `begin`. The results of `descend` of such a backend stay valid after the next rendering.
     """
 
     can_fail: bool
@@ -88,6 +88,20 @@ class OptimizerBackend(Protocol):
         """
         ...
 
+    def render_view(
+        self,
+        gaussians: GaussianMap,
+        camera: Camera,
+        T_map_camera: np.ndarray,
+        *,
+        contributions: bool,
+    ) -> Rendering:
+        """Render a map for other purposes than an iteration; see `GaussianOptimizer.render`.
+
+        Call it only after `end`. It changes neither the map nor the moments.
+        """
+        ...
+
     def steps(self, gaussians: GaussianMap) -> np.ndarray:
         """Return the number of Adam steps of each Gaussian, [N] int32. Call it only after `end`."""
         ...
@@ -118,7 +132,7 @@ class CpuBackend:
         self, adam: AdamConfig, weights: LossWeights, limits: ShapeLimits, *, threads: int = 1
     ) -> None:
         self._adam, self._weights, self._limits = Adam(adam), weights, limits
-        self._rasterizer = Rasterizer(threads=threads)
+        self._rasterizer, self._memory = Rasterizer(threads=threads), RenderMemory()
         self._by_planes = np.empty((5, 0, 0), np.float32)
         self._gaussians: GaussianMap | None = None  # Map between `begin` and `end`.
         self._images = PreparedImages()
@@ -186,6 +200,24 @@ class CpuBackend:
         if binning > 1:  # The weights are sums over the pixels of the full image.
             visible = replace(visible, weights=visible.weights * binning**2)
         return loss, visible
+
+    def render_view(
+        self,
+        gaussians: GaussianMap,
+        camera: Camera,
+        T_map_camera: np.ndarray,
+        *,
+        contributions: bool,
+    ) -> Rendering:
+        return render(
+            gaussians.rows,
+            camera,
+            se3.inverse(T_map_camera),
+            bounds=gaussians.bounds,
+            memory=self._memory,
+            contributions=contributions,
+            threads=self.threads,
+        )
 
     def _map(self) -> GaussianMap:
         assert self._gaussians is not None, "begin comes first"

@@ -134,10 +134,7 @@ class Rasterizer:
         Raises:
             DataError: The camera has lens distortion.
         """
-        if camera.distortion:
-            raise DataError(
-                "the rasterizer does not support lens distortion. Pass camera.rectified()."
-            )
+        require_undistorted(camera)
         size = (PLANES, camera.height, camera.width)
         if self._planes.shape != size:
             self._planes = _new_planes(camera.height, camera.width)
@@ -244,6 +241,16 @@ class Rasterizer:
         return self._indices[: self._visible]
 
 
+def require_undistorted(camera: Camera) -> None:
+    """Check that the rasterizer supports a camera.
+
+    Raises:
+        DataError: The camera has lens distortion.
+    """
+    if camera.distortion:
+        raise DataError("the rasterizer does not support lens distortion. Pass camera.rectified().")
+
+
 def _new_planes(height: int, width: int) -> np.ndarray:
     """Return planes [5, H, W] that start at a cache line.
 
@@ -343,8 +350,7 @@ def render(
         DataError: The camera has lens distortion.
         ValueError: The shapes of the arrays do not match.
     """
-    if camera.distortion:
-        raise DataError("the rasterizer does not support lens distortion. Pass camera.rectified().")
+    require_undistorted(camera)
     T = np.ascontiguousarray(np.asarray(T_camera_map)[:3], np.float32)
     intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
     size = camera.width, camera.height

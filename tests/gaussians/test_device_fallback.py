@@ -126,7 +126,7 @@ def test_plan_of_a_failed_device_is_repeated_by_the_cpu(
     assert fit.optimizer.device.metrics() == {"device_failed": 1, "on_gpu": 0}
     assert fit.optimizer.threads == 2
     (record,) = caplog.records
-    assert "out of memory. The CPU fits the map from now on" in record.getMessage()
+    assert "out of memory. The CPU fits and renders the map from now on" in record.getMessage()
     assert "RuntimeError: CUDA error 2" in caplog.text  # The traceback of the cause.
 
 

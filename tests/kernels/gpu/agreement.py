@@ -8,6 +8,8 @@ import numpy as np
 LIMITS = {
     "planes to C++": 5e-7,  # Relative to the largest value of the plane.
     "planes to reference": 4e-6,
+    "weights of Gaussians to C++": 5e-7,  # Relative to the largest weight.
+    "weights of Gaussians to reference": 2e-6,
     "derivatives by rows to C++": 1e-5,  # Norms, for each group of columns.
     "derivatives by rows to reference": 2e-5,
     "C++ derivatives by rows to reference": 2e-5,
@@ -28,6 +30,8 @@ LIMITS = {
     "median of rows after ten iterations": 1e-5,
     "loss in ten iterations": 1e-4,
     "exposure after ten iterations": 1e-4,
+    "motion of poses in ten iterations": 5e-6,
+    "moments of poses in ten iterations": 2e-5,
 }
 measured: dict[str, list[tuple[float, str]]] = {}
 

@@ -34,6 +34,7 @@ from triton.compiler import ASTSource
 from ldo_service.kernels.gpu import (
     blending,
     block_means,
+    contributions,
     equation_sums,
     loss,
     projection,
@@ -107,6 +108,27 @@ KERNELS = (
         {},
         blending.ONE_WARP,
         (99, 95, 102, 93, 89, 96, 95),
+    ),
+    Kernel(
+        contributions.median_depths,
+        (FLOATS, INTS, INTS, INTS, INT, INT, INT, FLOATS),
+        {},
+        blending.ONE_WARP,
+        (58, 58, 58, 55, 55, 64, 58),
+    ),
+    Kernel(
+        contributions.contribute,
+        (FLOATS, INTS, INTS, INTS, INTS, INTS, INT, INT, INT, FLOATS, INTS),
+        {},
+        blending.ONE_WARP,
+        (72, 72, 72, 69, 69, 80, 67),
+    ),
+    Kernel(
+        contributions.add_pairs,
+        (FLOATS, INTS, INT, INTS, INTS, FLOATS),
+        {"BLOCK": LANES},
+        FOUR_WARPS,
+        (20, 19, 19, 19, 19, 19, 20),
     ),
     Kernel(
         block_means.block_means,
