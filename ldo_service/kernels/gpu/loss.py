@@ -29,7 +29,7 @@ C2 = tl.constexpr(0.03 * 0.03)
 @triton.jit
 def tap(k: tl.constexpr):
     """Return the weight of the SSIM window k pixels from its middle; the 11 weights add up to 1."""
-    if k == 0:
+    if k == 0:  # noqa: SIM116
         return TAP0
     elif k == 1:  # noqa: RET505
         return TAP1
@@ -88,11 +88,12 @@ def means_along_rows(planes, color, mask, exposure, width, height, out, BLOCK: t
     x, y, squares = x0 * tap(0), y0 * tap(0), (x0 * x0 + y0 * y0) * tap(0)
     product = (x0 * y0) * tap(0)
     for k in tl.static_range(1, 6):
+        is_right, is_left = is_live & (column + k < width), is_live & (column - k >= 0)
         x1, y1, _, _ = exposed_at(
-            planes, color, mask, exposure, at + k, channel, pixel + k, is_live & (column + k < width)
+            planes, color, mask, exposure, at + k, channel, pixel + k, is_right
         )
         x2, y2, _, _ = exposed_at(
-            planes, color, mask, exposure, at - k, channel, pixel - k, is_live & (column - k >= 0)
+            planes, color, mask, exposure, at - k, channel, pixel - k, is_left
         )
         x += (x1 + x2) * tap(k)
         y += (y1 + y2) * tap(k)
@@ -211,9 +212,7 @@ def color_gradient(
         down, is_down = here + k * width, is_live & (row + k < height)
         up, is_up = here - k * width, is_live & (row - k >= 0)
         by_x += (tl.load(down, is_down, 0.0) + tl.load(up, is_up, 0.0)) * tap(k)
-        by_squares += (
-            tl.load(down + size, is_down, 0.0) + tl.load(up + size, is_up, 0.0)
-        ) * tap(k)
+        by_squares += (tl.load(down + size, is_down, 0.0) + tl.load(up + size, is_up, 0.0)) * tap(k)
         by_product += (
             tl.load(down + 2 * size, is_down, 0.0) + tl.load(up + 2 * size, is_up, 0.0)
         ) * tap(k)
