@@ -1,5 +1,6 @@
 """Optimization through the GPU backend in the interpreter of Triton, compared with the C++."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -17,13 +18,15 @@ from ldo_service.geometry import se3
 from ldo_service.kernels.gpu.arrays import HostArray
 from tests.gaussians.conftest import FEW, halved, window
 from tests.kernels.gpu.agreement import check
-from tests.kernels.gpu.scenes import ARRAYS, FilledArrays, descent, frame_loss, plane_rendering
+from tests.kernels.gpu.scenes import FilledArrays, descent, frame_loss, plane_rendering
+
+from tests.gaussians.gpu_lockstep import LockstepBackend, Recorder  # isort: skip  # Triton.
 
 CONFIG = GaussianOptimizerConfig(half_share=0.2, usual_reach=500)
 
 
 @pytest.fixture(autouse=True)
-def _setting(monkeypatch: pytest.MonkeyPatch):
+def _setting(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Halve small images, launch few large programs, and compute without warnings."""
     monkeypatch.setattr("ldo_service.gaussians.optimizer.MIN_HALVED_PX", 32)
     monkeypatch.setattr("ldo_service.gaussians.exposure.MIN_BLOCK_PX", 4)
@@ -34,22 +37,28 @@ def _setting(monkeypatch: pytest.MonkeyPatch):
         yield
 
 
-class Mapping:
-    """A map of the room, which grows and shrinks between plans of the optimizer."""
+@pytest.fixture
+def recorder(monkeypatch: pytest.MonkeyPatch) -> Recorder:
+    return Recorder(monkeypatch)
 
-    def __init__(self, room: Sequence, size: int, *, on_gpu: bool) -> None:
-        self.room, self.size, self.on_gpu = room, size, on_gpu
+
+class Mapping:
+    """A map of the room, which grows and shrinks between plans of the optimizer.
+
+    With a recorder, the GPU runs the plans, and the CPU repeats each iteration.
+    """
+
+    def __init__(self, room: Sequence, size: int, recorder: Recorder | None = None) -> None:
+        self.room, self.size, self.recorder = room, size, recorder
         self.gaussians, self.views = GaussianMap(), {}
         self.optimizer = self.new_optimizer()
         self.losses: list[float] = []
         self.weights: list[float] = []
 
     def new_optimizer(self) -> GaussianOptimizer:
-        if not self.on_gpu:
+        if self.recorder is None:
             return GaussianOptimizer(CONFIG)
-        from ldo_service.gaussians.gpu_backend import GpuBackend  # It imports Triton.
-
-        self.backend = GpuBackend(ARRAYS, CONFIG.adam, CONFIG.loss, CONFIG.limits)
+        self.backend = LockstepBackend(CONFIG, self.recorder)
         return GaussianOptimizer(CONFIG, backend=self.backend)
 
     def insert(self, index: int) -> None:
@@ -77,8 +86,13 @@ class Mapping:
 
     def restart(self) -> None:
         """Continue with the state of a snapshot."""
-        saved, moments = self.gaussians.snapshot(), self.optimizer.snapshot()
-        self.gaussians, self.optimizer = GaussianMap.restore(saved), self.new_optimizer()
+        self.continue_from(self)
+
+    def continue_from(self, other: "Mapping") -> None:
+        """Continue with map, views and moments of another mapping, in a new optimizer."""
+        saved, moments = other.gaussians.snapshot(), other.optimizer.snapshot()
+        self.gaussians, self.views = GaussianMap.restore(saved), dict(other.views)
+        self.optimizer = self.new_optimizer()
         self.optimizer.restore(moments)
 
     def run(self, plans: list[list[int]]) -> None:
@@ -97,12 +111,18 @@ class Mapping:
         self.fit(third)
 
 
-def compare(room: Sequence, size: int, plans: list[list[int]]) -> Mapping:
-    """Compare map, exposures, moments and losses of both backends, and return the GPU's mapping."""
-    cpu, gpu = (Mapping(room, size, on_gpu=on_gpu) for on_gpu in (False, True))
+def run_both(room: Sequence, recorder: Recorder, size: int, plans: list[list[int]]) -> Mapping:
+    """Run plans on both backends, compare the results, and return the GPU's mapping."""
+    cpu, gpu = Mapping(room, size), Mapping(room, size, recorder)
     cpu.run(plans)
     gpu.run(plans)
-    name = f"{size}x{size}"
+    compare(gpu, cpu)
+    return gpu
+
+
+def compare(gpu: Mapping, cpu: Mapping) -> None:
+    """Compare map, exposures, moments and losses of two mappings."""
+    name = f"{cpu.size}x{cpu.size}"
     assert len(gpu.losses) == len(cpu.losses)
     losses = np.array(gpu.losses) / cpu.losses - 1
     check("loss in ten iterations", np.abs(losses).max(), name)
@@ -123,19 +143,22 @@ def compare(room: Sequence, size: int, plans: list[list[int]]) -> Mapping:
     np.testing.assert_array_equal(saved["ids"], wanted["ids"])
     assert np.mean(saved["steps"] != wanted["steps"]) < 0.01
     assert gpu.gaussians.version > 0
-    return gpu
 
 
-def test_iterations_on_a_small_window_agree_with_the_cpu(room: Sequence) -> None:
-    gpu = compare(room, 32, [[4], [8], [4, 0, 4]])
-    mirror = gpu.backend.mirror
+def test_iterations_on_a_small_window_agree_with_the_cpu(
+    room: Sequence, recorder: Recorder
+) -> None:
+    gpu = run_both(room, recorder, 32, [[4], [8], [4, 0, 4]])
+    mirror = gpu.backend.gpu.mirror
     assert 0 < mirror.downloaded <= len(gpu.gaussians)
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(3600)  # It takes seven minutes of CPU time.
-def test_ten_iterations_through_the_mirror_agree_with_the_cpu(room: Sequence) -> None:
-    gpu = compare(room, 64, [[4, 0, 4, 4], [8, 0, 8], [8, 4, 8]])
+@pytest.mark.timeout(3600)  # It takes a minute of CPU time.
+def test_ten_iterations_through_the_mirror_agree_with_the_cpu(
+    room: Sequence, recorder: Recorder
+) -> None:
+    gpu = run_both(room, recorder, 32, [[4, 0, 4, 4], [8, 0, 8], [8, 4, 8]])
     assert len(gpu.losses) == 10
 
 
@@ -152,13 +175,26 @@ class PoisonedArrays(FilledArrays):
         return values
 
 
+class PoisonedMapping(Mapping):
+    """A map on a GPU with `PoisonedArrays`."""
+
+    def __init__(self, room: Sequence, size: int, width: int) -> None:
+        self.arrays = PoisonedArrays(width)
+        super().__init__(room, size)
+
+    def new_optimizer(self) -> GaussianOptimizer:
+        from ldo_service.gaussians.gpu_backend import GpuBackend  # It imports Triton.
+
+        backend = GpuBackend(self.arrays, CONFIG.adam, CONFIG.loss, CONFIG.limits)
+        return GaussianOptimizer(CONFIG, backend=backend)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("what", "width"), [("rows of the map", 16), ("loss", 8)])
 def test_cpu_repeats_a_plan_whose_results_are_nan(
-    room: Sequence, what: str, width: int, monkeypatch: pytest.MonkeyPatch, caplog
+    room: Sequence, what: str, width: int, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("tests.gaussians.test_gpu_backend.ARRAYS", PoisonedArrays(width))
-    cpu, gpu = (Mapping(room, 32, on_gpu=on_gpu) for on_gpu in (False, True))
+    cpu, gpu = Mapping(room, 32), PoisonedMapping(room, 32, width)
     for mapping in (cpu, gpu):
         mapping.insert(0)
         mapping.insert(4)
@@ -172,10 +208,33 @@ def test_cpu_repeats_a_plan_whose_results_are_nan(
         np.testing.assert_array_equal(gpu.optimizer.snapshot()[name], values)
 
 
-def test_images_are_uploaded_again_if_they_changed(room: Sequence) -> None:
-    mapping = Mapping(room, 32, on_gpu=True)
+@pytest.mark.slow
+@pytest.mark.timeout(3600)  # It takes three minutes of CPU time.
+def test_plan_of_a_keyframe_agrees_with_the_cpu_in_each_iteration(
+    room: Sequence, recorder: Recorder
+) -> None:
+    """The map has moments and step counts of earlier plans, and new Gaussians of the keyframe."""
+    cpu, gpu = Mapping(room, 64), Mapping(room, 64, recorder)
+    cpu.insert(0)
+    cpu.insert(4)
+    cpu.fit([4, 0, 4])
+    cpu.insert(8)
+    gpu.continue_from(cpu)
+    cpu.restart()
+    cpu.losses, cpu.weights = [], []
+    plan = [8, 8, 0, 8, 4, 8, 8, 0, 8, 4]
+    for mapping in (cpu, gpu):
+        mapping.fit(plan)
+    compare(gpu, cpu)
+    assert len(gpu.backend.pairs) == 10
+    assert min(gpu.backend.pairs) > 200
+    assert 0 < gpu.backend.halved < 10
+
+
+def test_images_are_uploaded_again_if_they_changed(room: Sequence, recorder: Recorder) -> None:
+    mapping = Mapping(room, 32, recorder)
     mapping.insert(0)
-    view, backend = mapping.views[0], mapping.backend
+    view, backend = mapping.views[0], mapping.backend.gpu
     first = backend._frame(view, is_half=False)
     assert backend._frame(replace(view, T_map_camera=np.eye(4)), is_half=False) is first
     assert backend._frame(view, is_half=True) is not first

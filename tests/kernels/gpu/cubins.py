@@ -4,11 +4,12 @@
 
 The program prints registers, stack and shared memory of each kernel as a table. It exits with
 status 1 if a kernel uses a stack or spills registers, needs more registers than its limit, or
-contains an instruction whose result differs between GPUs: an approximation, a flush of denormal
-numbers, TF32, or a fused product and sum. A kernel must not depend on the values of its integers
-either, because a launch would then compile other code than this program. At first the program
-compiles two kernels with such faults, and checks that it detects them. Without arguments, it
-compiles for all of CAPABILITIES.
+contains an instruction whose result differs between GPUs or runs: an approximation, a flush of
+denormal numbers, TF32, a fused product and sum, or an atomic operation on floats. Shuffles are
+allowed, because a lane reads a fixed other lane, so that sums have a fixed order. A kernel
+must not depend on the values of its integers either, because a launch would then compile other
+code than this program. At first the program compiles three kernels with such faults, and checks
+that it detects them. Without arguments, it compiles for all of CAPABILITIES.
 """
 
 import os
@@ -27,6 +28,7 @@ os.environ.pop("TRITON_INTERPRET", None)  # The interpreter would replace the co
 os.environ.setdefault("TRITON_CACHE_DIR", str(Path("build/triton").resolve()))
 
 import triton
+import triton.language as tl
 from triton.backends.compiler import GPUTarget
 from triton.backends.nvidia import compiler as nvidia
 from triton.compiler import ASTSource
@@ -53,7 +55,9 @@ TOOLS = Path(nvidia.__file__).parent / "bin"
 FLOATS, INTS, BYTES, INT, FLOAT = "*fp32", "*i32", "*u8", "i32", "fp32"
 DOUBLES = "*fp64"
 SPARE_REGISTERS = 8
-DIFFERING = re.compile(r"\b(fma\.|mad\.f|\S*\.approx|\S*\.ftz|div\.full|\S*tf32)\S*")
+DIFFERING = re.compile(
+    r"\b(fma\.|mad\.f|\S*\.approx|\S*\.ftz|div\.full|\S*tf32|(?:atom|red)\.\S*\.(?:b?f)\d)\S*"
+)
 
 
 @dataclass(frozen=True)
@@ -77,7 +81,15 @@ class Kernel:
     @property
     def name(self) -> str:
         suffix = ", strips" if self.constants.get("WITH_STRIPS") else ""
+        if self.function is block_means.block_means:
+            suffix = f", {self.constants['LANES']} lanes"
         return self.function.__name__ + suffix
+
+
+@triton.jit
+def atomic_sum(values, out):
+    """Add floats in the order in which the programs happen to run, a planted fault."""
+    tl.atomic_add(out, tl.load(values + tl.program_id(0)))
 
 
 KERNELS = (
@@ -130,19 +142,26 @@ KERNELS = (
         FOUR_WARPS,
         (20, 19, 19, 19, 19, 19, 20),
     ),
-    Kernel(
-        block_means.block_means,
-        (FLOATS, INT, INT, INT, INT, INT, FLOATS),
-        {"LANES": 256},
-        blending.ONE_WARP,
-        (36, 39, 42, 41, 40, 39, 39),
+    *(  # The lanes for images of up to 359, 679 and 1319 pixels width.
+        Kernel(
+            block_means.block_means,
+            (FLOATS, INT, INT, INT, INT, INT, FLOATS),
+            {"LANES": lanes},
+            blending.ONE_WARP,
+            registers,
+        )
+        for lanes, registers in (
+            (64, (19, 19, 20, 20, 20, 20, 21)),
+            (256, (36, 39, 42, 41, 40, 39, 39)),
+            (1024, (111, 113, 106, 80, 95, 80, 80)),
+        )
     ),
     Kernel(
         loss.means_along_rows,
         (FLOATS, BYTES, BYTES, FLOATS, INT, INT, FLOATS),
         {"BLOCK": PIXEL_LANES},
         FOUR_WARPS,
-        (64, 40, 48, 48, 47, 54, 48),
+        (72, 71, 72, 72, 72, 72, 68),
     ),
     Kernel(
         loss.ssim_derivatives,
@@ -272,7 +291,12 @@ def compiled(index: int, capability: int, changes: Mapping[str, Any] | None = No
         capability: Compute capability, such as 86.
         changes: Options that replace those of the kernel.
     """
-    kernel = KERNELS[index]
+    return compiled_kernel(KERNELS[index], capability, changes)
+
+
+def compiled_kernel(
+    kernel: Kernel, capability: int, changes: Mapping[str, Any] | None = None
+) -> Compiled:
     names = kernel.function.arg_names
     types = (*kernel.types, *["constexpr"] * len(kernel.constants))
     aligned = {
@@ -339,8 +363,8 @@ def specialized_integers(kernel: Kernel) -> list[str]:
 def undetected_faults() -> list[str]:
     """Return an error message for each planted fault that is not detected.
 
-    The planted faults are a kernel with too few registers and one with fused products, compiled for
-    sm_86, and one whose integers are specialized.
+    The planted faults are a kernel with too few registers, one with fused products and one with an
+    atomic sum, compiled for sm_86, and one whose integers are specialized.
     """
     by_name = {kernel.name: i for i, kernel in enumerate(KERNELS)}
     spilling = compiled(by_name["blend_backward"], 86, {"maxnreg": 64})
@@ -348,8 +372,10 @@ def undetected_faults() -> list[str]:
     assert PINNED["enable_fp_fusion"] is False
     forward = KERNELS[by_name["blend_forward"]]
     specialized = specialized_integers(replace(forward, function=triton.jit(forward.function.fn)))
+    atomic = compiled_kernel(Kernel(atomic_sum, (FLOATS, FLOATS), {}, PINNED, ()), 86)
     missed = [] if spilling.stack else ["spilled registers were not detected"]
     missed += [] if fused.differing else ["fused products were not detected"]
+    missed += [] if atomic.differing else ["atomic sums of floats were not detected"]
     return missed + ([] if len(specialized) == 3 else ["specialized integers were not detected"])
 
 

@@ -98,7 +98,7 @@ def test_loss_without_measured_depth_has_no_depth_term() -> None:
 
 
 @pytest.mark.parametrize("side", [3, 8])
-def test_block_means_equal_those_of_opencv(side: int) -> None:
+def test_block_means_equal_those_of_opencv_and_the_reference(side: int) -> None:
     planes = IMAGES["wide"][0]
     got = plane_rendering.mean_blocks(ARRAYS, rendering_of(planes), side)
     down, across = 18 // side, 37 // side
@@ -107,6 +107,8 @@ def test_block_means_equal_those_of_opencv(side: int) -> None:
         whole = np.ascontiguousarray(planes[plane, : down * side, : across * side])
         wanted = cv2.resize(whole, (across, down), interpolation=cv2.INTER_AREA)
         check("block means to OpenCV", peak(got[k], wanted), f"side {side}, plane {plane}")
+        wanted = whole.astype(float).reshape(down, side, across, side).mean(axis=(1, 3))
+        check("block means to reference", peak(got[k], wanted), f"side {side}, plane {plane}")
 
 
 def test_image_smaller_than_a_block_has_no_block_means() -> None:

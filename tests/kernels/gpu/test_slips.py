@@ -114,7 +114,8 @@ def _fresh_results(monkeypatch: pytest.MonkeyPatch):
 
 
 def forget_results() -> None:
-    for cached in (scenes.of_kernel, test_gradients.gradients_of, test_residuals.of_kernel):
+    of_gradients = test_gradients.gradients_of, test_gradients.step_of
+    for cached in (scenes.of_kernel, *of_gradients, test_residuals.of_kernel):
         cached.cache_clear()
 
 
