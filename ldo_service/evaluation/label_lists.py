@@ -14,6 +14,8 @@ BUILDING = frozenset({BACKGROUND, "wall", "floor", "ceiling"})  # Names evaluate
 # Indices for ground truth that is ignored, and for a name of the map that is not in the list.
 VOID, UNKNOWN = 255, 254
 MAX_NAMES = UNKNOWN
+# Classes of NYU40 that collect objects of any name.
+COLLECTIVE = frozenset({"otherstructure", "otherfurniture", "otherprop"})
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -99,8 +101,12 @@ def object_labels(map_names: Sequence[str]) -> np.ndarray:
 
 
 def is_void(name: str) -> bool:
-    """Return whether a class name of a data set marks pixels without a label, such as `void`."""
-    return normalized(name) in VOID_NAMES
+    """Return whether pixels of a class of a data set are ignored.
+
+    They are ignored if the class means no label, such as `void`, or any object, such as
+    `otherprop`.
+    """
+    return normalized(name) in VOID_NAMES | COLLECTIVE
 
 
 def object_name(name: str) -> str:

@@ -55,6 +55,13 @@ def test_full_list_has_every_object_and_no_parts_of_the_building() -> None:
     assert of_map["wall"] == "background"
 
 
+def test_collective_classes_of_nyu40_are_ignored() -> None:
+    source = ("", "chair", "otherprop", "otherfurniture", "otherstructure")
+    for labels in (coco_list(source), full_list(source)):
+        assert labels.names == ("background", "chair")
+        assert labels.of_truth(source)[:5].tolist() == [VOID, 1, VOID, VOID, VOID]
+
+
 def test_ids_beyond_the_names_are_void_in_truth_and_unknown_in_a_map() -> None:
     labels = full_list(SOURCE)
     assert set(labels.of_truth(SOURCE)[len(SOURCE) :]) == {VOID}
