@@ -15,6 +15,7 @@ from ldo_service.config import Config, actor_parameters, load_config
 from ldo_service.datasets import open_sequence
 from ldo_service.errors import DataError
 from ldo_service.evaluation import loops, semantics, trajectory, views
+from ldo_service.evaluation.label_lists import load_classes
 from ldo_service.evaluation.label_measures import DetectionCounts
 from ldo_service.evaluation.loops import LoopErrors
 from ldo_service.evaluation.lpips import Lpips
@@ -105,6 +106,14 @@ def evaluate(
             "two inputs, float32 [1, 3, H, W], RGB in -1..1; one output with a single number",
         ),
     ] = None,
+    classes: Annotated[
+        str,
+        argument(
+            metavar="NAME|FILE",
+            help="also evaluate the labels with a list of classes: nyu40, scannet20, replica51, or "
+            "a text file with one name per line",
+        ),
+    ] = "",
     odometry_as_truth: Annotated[
         bool,
         argument(
@@ -130,6 +139,7 @@ def evaluate(
       ldo run ~/data/rgbd_dataset_freiburg1_desk --out runs/desk --hold-out-every 5
       ldo eval runs/desk ~/data/rgbd_dataset_freiburg1_desk
     """
+    listed = load_classes(classes) if classes else None
     config = run_config(folder)
     threads = actor_parameters(config).mapper.thread_count()
     distance = Lpips(lpips, threads=threads) if lpips else None
@@ -141,7 +151,9 @@ def evaluate(
             raise DataError(f"{source} contains no odometry. Remove --odometry-as-truth.")
         sequence = OdometryAsTruth(sequence)
     with progress("eval", work(run, sequence), Console(stderr=True)) as advance:
-        results = evaluate_run(run, sequence, advance, distance=distance, threads=threads)
+        results = evaluate_run(
+            run, sequence, advance, distance=distance, threads=threads, classes=listed
+        )
     if json_:
         about = {"lpips": lpips and str(lpips), "labelled_by": labelled_by(config)}
         print(json.dumps({**to_json(results), **about}, indent=1))

@@ -53,17 +53,18 @@ def read_depth(path: Path) -> np.ndarray:
     return image
 
 
-def read_labels(path: Path, dtype: type[np.unsignedinteger]) -> np.ndarray:
-    """Read a label image [H, W] of type `dtype`.
+def read_labels(path: Path, *dtypes: type[np.unsignedinteger]) -> np.ndarray:
+    """Read a label image [H, W] of one of the given types.
 
     Raises:
-        FrameError: The file cannot be read or decoded, or its pixels are not of type `dtype`.
+        FrameError: The file cannot be read or decoded, or its pixels are of another type.
     """
     image = _decode(_read(path), str(path), cv2.IMREAD_UNCHANGED)
-    if image.dtype != dtype or image.ndim != 2:
+    if image.dtype not in dtypes or image.ndim != 2:
+        bits = " or ".join(str(np.dtype(dtype).itemsize * 8) for dtype in dtypes)
         raise FrameError(
-            f"{path} is {image.dtype}{image.shape}, expected one channel of "
-            f"{np.dtype(dtype).itemsize * 8} bits. Export the labels again as gray PNG."
+            f"{path} is {image.dtype}{image.shape}, expected one channel of {bits} bits. Export "
+            "the labels again as gray PNG."
         )
     return image
 

@@ -6,6 +6,7 @@ intrinsic/intrinsic_color.txt     4x4 by rows, for the size of the color images
 intrinsic/intrinsic_depth.txt     4x4 by rows, for the size of the depth images
 intrinsic/extrinsic_color.txt     optional: 4x4 from the color camera to the sensor
 intrinsic/extrinsic_depth.txt     optional: 4x4 from the depth camera to the sensor
+label-filt/*.png                  optional: labels, see `scannet_labels`
 
 ScanNet's own exports are aligned: their extrinsics are the identity. Their color images have
 1296x968 pixels and their depth images 640x480. In an aligned export, color is resampled to the
@@ -20,6 +21,7 @@ import numpy as np
 
 from ldo_service.errors import DataError
 from ldo_service.geometry import Trajectory, se3
+from ldo_service.geometry.sequence import TrueLabels
 
 from .files import (
     name_of,
@@ -31,6 +33,7 @@ from .files import (
 )
 from .images import first_size, read_color, read_depth
 from .rig import Rig, RigSequence, SequenceOptions
+from .scannet_labels import ScanNetLabels
 
 DEPTH_SCALE = 1000.0  # Units per meter in all exports.
 
@@ -67,6 +70,11 @@ class ScanNetSequence(RigSequence):
         """Return the poses of the depth camera; see `RigSequence.read_depth_poses`."""
         paths = [self._folder / "pose" / f"{path.stem}.txt" for path in self._files.color]
         return read_trajectory(self.stamps_ns, paths)
+
+    def true_labels(self) -> TrueLabels | None:
+        """Return the ground-truth labels, or None if the folder has no label images."""
+        numbers, is_registering = self._files.numbers, self.registration == "reader"
+        return ScanNetLabels(self._folder, numbers, self.rig, is_registering).read()
 
 
 def _rig(folder: Path, color_size: tuple[int, int], depth_size: tuple[int, int]) -> Rig:

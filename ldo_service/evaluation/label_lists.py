@@ -2,18 +2,22 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-from ldo_service.detection.vocabulary import COCO, canonical, coco_class, normalized
-from ldo_service.errors import DataError
+from ldo_service.detection.vocabulary import COCO, canonical, coco_class, normalized, read_names
+from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry.sequence import VOID_NAMES
 
+HERE = Path(__file__).parent / "classes"  # Lists of class names, one file for each list.
 BACKGROUND = "background"
 BUILDING = frozenset({BACKGROUND, "wall", "floor", "ceiling"})  # Names evaluated as background.
 # Indices for ground truth that is ignored, and for a name of the map that is not in the list.
 VOID, UNKNOWN = 255, 254
 MAX_NAMES = UNKNOWN
+# Classes of NYU40 that collect objects of any name.
+COLLECTIVE = frozenset({"otherstructure", "otherfurniture", "otherprop"})
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -33,12 +37,13 @@ class LabelSet:
     def of_truth(self, class_names: Sequence[str]) -> np.ndarray:
         """Return a table from class ids of the data set to indices in the list, [256] uint8.
 
-        Classes that the evaluation ignores get the index VOID (255).
+        Classes that the evaluation ignores get the index VOID (255). These are classes without a
+        label, and classes that are not in the list.
         """
         table = np.full(256, VOID, np.uint8)
         for class_id, name in enumerate(class_names):
-            if not is_void(name):
-                table[class_id] = self.names.index(self.listed_name(name))
+            if not is_void(name) and (listed := self.listed_name(name)) in self.names:
+                table[class_id] = self.names.index(listed)
         return table
 
     def of_map(self, names: Sequence[str]) -> np.ndarray:
@@ -88,6 +93,52 @@ def full_list(class_names: Iterable[str]) -> LabelSet:
     return LabelSet("all names", names, object_name)
 
 
+def known_lists() -> list[str]:
+    """Return the names of the class lists of this package."""
+    return sorted(path.stem for path in HERE.glob("*.txt"))
+
+
+def load_classes(name: str) -> LabelSet:
+    """Return a class list of this package, or the list in a text file with one name per line.
+
+    Walls, floors and ceilings are background, and collective classes such as `otherprop` are left
+    out. Labels of data sets and maps are converted by the table of synonyms. A name that is not in
+    the list is converted to the first class of the list with the same COCO class: "dining table"
+    becomes "table" in `nyu40`.
+
+    Args:
+        name: Name of a list, such as "nyu40", or path of a text file.
+
+    Raises:
+        ConfigError: There is no such list, or the file is invalid.
+    """
+    path = HERE / f"{name}.txt" if name in known_lists() else Path(name).expanduser()
+    if not path.is_file():
+        raise ConfigError(
+            f"there is no list of classes {name}. Give a text file with one name per line, or one "
+            f"of {', '.join(known_lists())}."
+        )
+    listed = [canonical(line) for line in read_names(path) if not is_void(line)]
+    names = tuple(dict.fromkeys((BACKGROUND, *(n for n in listed if n not in BUILDING))))
+    if not 1 < len(names) <= MAX_NAMES:
+        raise ConfigError(
+            f"{path} has {len(names) - 1} names of objects, must have 1 to {MAX_NAMES - 1}. Remove "
+            "or add names."
+        )
+    by_coco: dict[str, str] = {}
+    for listed_name in names:
+        if found := coco_class(listed_name):
+            by_coco.setdefault(found, listed_name)
+
+    def listed_name_of(name: str) -> str:
+        plain = canonical(name)
+        if plain in BUILDING:
+            return BACKGROUND
+        return plain if plain in names else by_coco.get(coco_class(plain) or "", plain)
+
+    return LabelSet(path.stem, names, listed_name_of)
+
+
 def object_labels(map_names: Sequence[str]) -> np.ndarray:
     """Return a table [256] uint8 that replaces the labels of building parts in a map by background.
 
@@ -99,8 +150,12 @@ def object_labels(map_names: Sequence[str]) -> np.ndarray:
 
 
 def is_void(name: str) -> bool:
-    """Return whether a class name of a data set marks pixels without a label, such as `void`."""
-    return normalized(name) in VOID_NAMES
+    """Return whether pixels of a class of a data set are ignored.
+
+    They are ignored if the class means no label, such as `void`, or any object, such as
+    `otherprop`.
+    """
+    return normalized(name) in VOID_NAMES | COLLECTIVE
 
 
 def object_name(name: str) -> str:

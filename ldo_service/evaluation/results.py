@@ -13,6 +13,7 @@ from ldo_service.geometry.sequence import Sequence
 
 from . import loops, semantics, trajectory, views
 from .finished_run import FinishedRun, FrameCounts, at_stamps
+from .label_lists import LabelSet
 from .label_results import finite, plain_labels, sheet_of_labels
 from .loops import LoopErrors, evaluate_loops, seen_keyframes
 from .pictures import save_picture, trajectory_picture
@@ -49,6 +50,7 @@ def evaluate_run(
     distance: Distance | None = None,
     threads: int = 1,
     evaluated: EvaluatedFrames | None = None,
+    classes: LabelSet | None = None,
 ) -> Results:
     """Evaluate trajectories, loops, maps and labels of a run, and save pictures of them.
 
@@ -61,6 +63,7 @@ def evaluate_run(
         threads: Threads of the renderer.
         evaluated: Frames whose renderings are evaluated; None for all held-out frames and every
             fifth training frame, see `views.PROTOCOL`.
+        classes: List of classes to evaluate in addition to COCO and all names; None for no list.
 
     Raises:
         DataError: If a file of the run does not fit the sequence, or nothing can be evaluated.
@@ -79,7 +82,12 @@ def evaluate_run(
     )
     rendered = len(evaluated.posed)
     labels = evaluate_labels(
-        sequence, run, evaluated, lambda done: advance(rendered + done), threads=threads
+        sequence,
+        run,
+        evaluated,
+        lambda done: advance(rendered + done),
+        classes=classes,
+        threads=threads,
     )
     pictures = {"trajectory.png": trajectory_picture(run.estimates["final"], truth)}
     if renderings:

@@ -39,10 +39,11 @@ the largest sum_i w_i p_i(s) over its Gaussians i. Pixels of all frames are pool
 true label are ignored. A name of the map that is not in the list is always wrong.
 COCO: the list of background and the COCO classes of the source, by detection/synonyms.yaml; all
 other classes are background. All names: the list of background (wall, floor, ceiling) and every
-object name of the source; an object with a COCO class has the name of that class. mIoU, accuracy
-and IoU by frequency are means over classes. They are given twice: for the classes with more than
-0.2 % of the pixels, and for all that occur. Pixel accuracy is over all pixels. Per image: mIoU over
-the classes of a frame, averaged over the frames.
+object name of the source; an object with a COCO class has the name of that class. Option --classes:
+the list of background and the classes of a file; pixels of other classes are ignored.
+mIoU, accuracy and IoU by frequency are means over classes. They are given twice: for the classes
+with more than 0.2 % of the pixels, and for all that occur. Pixel accuracy is over all pixels. Per
+image: mIoU over the classes of a frame, averaged over the frames.
 Consistency: fraction of equal labels in two frames 3 apart, among the pixels that show an object in
 at least one of them. Pixels correspond by measured depth and true poses, or by the run's final
 poses if no true poses are known.
@@ -150,8 +151,14 @@ class MapLabels:
 class LabelEvaluator:
     """Accumulator of the label errors of one map, to which views are added one by one."""
 
-    def __init__(self, map_names: Sequence[str], class_names: Sequence[str]) -> None:
-        self._lists = (coco_list(class_names), full_list(class_names))
+    def __init__(
+        self,
+        map_names: Sequence[str],
+        class_names: Sequence[str],
+        classes: LabelSet | None = None,
+    ) -> None:
+        more = () if classes is None else (classes,)
+        self._lists = (coco_list(class_names), full_list(class_names), *more)
         self._tables = [(x.of_truth(class_names), x.of_map(map_names)) for x in self._lists]
         self._confusions: list[list[np.ndarray]] = [[] for _ in self._lists]
         self._frames: list[int] = []
@@ -195,6 +202,7 @@ def evaluate_labels(
     judged: EvaluatedFrames,
     advance: Callable[[int], None],
     *,
+    classes: LabelSet | None = None,
     threads: int = 1,
 ) -> list[LabelErrors]:
     """Evaluate the labels of each labelled map.
@@ -204,6 +212,7 @@ def evaluate_labels(
         run: The run.
         judged: Frames to evaluate.
         advance: Progress function, called with the number of frames done so far.
+        classes: List of classes to evaluate in addition to COCO and all names; None for no list.
         threads: Threads of the renderer.
 
     Returns:
@@ -216,7 +225,7 @@ def evaluate_labels(
     labels, maps = sequence.true_labels(), labelled_maps(sequence, run, threads)
     if labels is None or not maps:
         return []
-    judges = [LabelEvaluator(map_.names, labels.class_names) for map_ in maps]
+    judges = [LabelEvaluator(map_.names, labels.class_names, classes) for map_ in maps]
     pairs = Pairs(sequence, run)
     for done, frame in enumerate(judged.posed, 1):
         image, truth = sequence[frame.index], labels.frame(frame.index)

@@ -238,6 +238,37 @@ def resample_color(
     return image, is_seen
 
 
+def resample_labels(labels: np.ndarray, color_camera: Camera, camera: Camera) -> np.ndarray:
+    """Resample a label image of the color camera to the pixels of another camera at the same pose.
+
+    Each pixel gets the label of the nearest pixel of the color image.
+
+    Args:
+        labels: Labels, [Hc, Wc] uint8 or uint16.
+        color_camera: Intrinsics of the label image.
+        camera: Intrinsics of the result.
+
+    Returns:
+        The labels [H, W]; 0 outside the field of view of the color camera.
+
+    Raises:
+        FrameError: The size of the label image differs from that of `color_camera`.
+    """
+    if labels.shape != (color_camera.height, color_camera.width):
+        raise FrameError(
+            f"the labels are {labels.shape[1]}x{labels.shape[0]} pixels, but the color image has "
+            f"{color_camera.width}x{color_camera.height}. Export the labels at the size of color."
+        )
+    if camera == color_camera:
+        return labels
+    u, v, is_seen = _color_of_depth_pixels(color_camera, camera)
+    # Ties go to the right and lower pixel; `rint` would alternate between neighbors.
+    columns = np.clip(np.floor(np.where(is_seen, u, 0) + 0.5), 0, color_camera.width - 1)
+    rows = np.clip(np.floor(np.where(is_seen, v, 0) + 0.5), 0, color_camera.height - 1)
+    found = labels[rows.astype(np.intp), columns.astype(np.intp)]
+    return np.where(is_seen, found, labels.dtype.type(0))
+
+
 def _halved(color: np.ndarray) -> np.ndarray:
     height, width = color.shape[0] // 2, color.shape[1] // 2
     return cv2.resize(

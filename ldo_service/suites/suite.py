@@ -61,6 +61,12 @@ class EvaluatedRun:
         """
         return self.results["labels"][-1]["lists"]["COCO"]["from 0.2 %"]
 
+    @property
+    def is_labelled(self) -> bool:
+        """True if a detector or a labeller ran, or if the results do not state it."""
+        who = self.results.get("labelled_by")
+        return who is None or any(who.values())
+
     def consistency(self) -> float | None:
         """Return the fraction of object pixels with equal labels in two views of the newest map.
 

@@ -15,14 +15,32 @@ def markdown(suite: Suite, outcomes: Sequence[Outcome]) -> str:
 
     If the suite has one sequence, one table shows all metrics. Otherwise there is one table for
     each metric, with a column for each sequence. A cell has the mean over the seeds, and with
-    several seeds the standard deviation. The first rows are published values.
+    several seeds the standard deviation. The first rows are published values. A line under each
+    table names the variants whose runs had neither a detector nor a labeller.
     """
-    parts = [f"# {suite.title}", suite.about.strip()]
+    parts, note = [f"# {suite.title}", suite.about.strip()], _unlabelled(suite, outcomes)
     if len(suite.sequences) == 1:
-        parts.append(_of_one_sequence(suite, outcomes))
+        parts += [_of_one_sequence(suite, outcomes), note]
     else:
-        parts += [_of_one_figure(suite, name, outcomes) for name in suite.figures]
+        for name in suite.figures:
+            parts += [_of_one_figure(suite, name, outcomes), note]
     return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _unlabelled(suite: Suite, outcomes: Sequence[Outcome]) -> str:
+    """Return a line that names the variants without detector and labeller; empty if all had one."""
+    variants = [
+        variant
+        for variant in suite.variants
+        if any(
+            o.evaluated is not None and not o.evaluated.is_labelled
+            for o in outcomes
+            if o.entry.variant == variant
+        )
+    ]
+    if not variants:
+        return ""
+    return f"{', '.join(variants)}: without a detector and a labeller; the maps have no labels."
 
 
 def _of_one_sequence(suite: Suite, outcomes: Sequence[Outcome]) -> str:

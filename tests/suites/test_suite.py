@@ -137,6 +137,24 @@ def test_single_sequence_gives_one_table_of_all_scores() -> None:
     ]
 
 
+def test_table_names_the_variants_that_ran_without_a_detector() -> None:
+    """A variant is named if one of its runs had neither a detector nor a labeller."""
+    line = "short: without a detector and a labeller; the maps have no labels."
+
+    def table(of_short: dict[str, str]) -> str:
+        who = {"plain": {"detector": "demo", "labeller": ""}, "short": of_short}
+        return markdown(
+            TWO,
+            [
+                Outcome(e, replace(scores(0.01), results={"labelled_by": who[e.variant]}))
+                for e in TWO.entries(Path())
+            ],
+        )
+
+    assert table({"detector": "", "labeller": ""}).count(f"|\n\n{line}\n") == len(TWO.figures)
+    assert "without a detector" not in table({"detector": "", "labeller": "demo"})
+
+
 @pytest.mark.parametrize("name", sorted(FIGURES))
 def test_score_that_was_not_evaluated_is_none(name: str) -> None:
     assert FIGURES[name].of(EvaluatedRun({}, {"trajectory": None, "rendering": []})) is None
