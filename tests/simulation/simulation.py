@@ -63,7 +63,7 @@ class Report:
 class Simulation:
     """One run."""
 
-    alive_within_s = ALIVE_WITHIN_S
+    alive_within_s = ALIVE_WITHIN_S  # A subclass may replace it.
 
     def __init__(
         self, loop: VirtualLoop, seed: int, only: Sequence[str] = (), remote: Sequence[str] = ()
