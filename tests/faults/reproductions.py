@@ -65,6 +65,7 @@ NAMES = {
     ),
     "initial_rate": ("initial_rate", "first_rate"),
     "final_rate": ("final_rate", "last_rate"),
+    "dead_lettered": ("dead_lettered", "set_aside"),
     "evicted_consumers": ("evicted_consumers", "evicted"),
     "on_saved": ("on_saved", "saved"),
     "T_prior_base": ("T_prior_base", "T_odom_base"),
@@ -180,7 +181,8 @@ async def counted(
         transport.deliver(LABEL_ADD.name, header(number), add_label(text, number + 1))
     while not running.done() and time.monotonic() < until_s:
         await asyncio.sleep(0.1)
-        if not stage._mailbox._order and stage.health().state == "ready":  # type: ignore[union-attr]
+        health = stage.health()
+        if health.steps + getattr(health, name("dead_lettered")) >= len(texts):
             break
     ended = running.done()
     running.cancel()
