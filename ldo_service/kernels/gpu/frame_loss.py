@@ -6,10 +6,13 @@ from typing import Any
 import numpy as np
 
 from . import loss
+from .arithmetic import PINNED
 from .arrays import Arrays
 from .plane_rendering import FOUR_WARPS, PLANES, PlaneRendering, programs_for
 
 PIXEL_LANES = 256  # Lanes of the programs, each of which computes one pixel value.
+# `means_along_rows` needs up to 72 registers with four warps, and up to 51 with eight.
+ROW_SUMS = {"num_warps": 8, **PINNED}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -62,7 +65,7 @@ def image_loss(
     per_value = 1 / np.float32(values)
     l1, d_ssim, depth = (np.float32(weight) for weight in weights)
     measured = max(frame.measured, 1)
-    loss.means_along_rows[grid](*seen, width, height, along, **options)
+    loss.means_along_rows[grid](*seen, width, height, along, BLOCK=PIXEL_LANES, **ROW_SUMS)
     loss.ssim_derivatives[grid](along, width, height, derivatives, ssims, **options)
     loss.derivatives_along_rows[grid](derivatives, width, height, along, **options)
     loss.color_gradient[grid](

@@ -45,7 +45,7 @@ from ldo_service.kernels.gpu import (
 )
 from ldo_service.kernels.gpu.arithmetic import PINNED
 from ldo_service.kernels.gpu.descent import CORRECTIONS
-from ldo_service.kernels.gpu.frame_loss import PIXEL_LANES
+from ldo_service.kernels.gpu.frame_loss import PIXEL_LANES, ROW_SUMS
 from ldo_service.kernels.gpu.plane_rendering import FOUR_WARPS, LANES
 
 # Compute capabilities: Turing, A100, RTX 30, RTX 40, H100, B200, RTX 50. The Jetson Orin, 87, uses
@@ -160,8 +160,8 @@ KERNELS = (
         loss.means_along_rows,
         (FLOATS, BYTES, BYTES, FLOATS, INT, INT, FLOATS),
         {"BLOCK": PIXEL_LANES},
-        FOUR_WARPS,
-        (72, 71, 72, 72, 72, 72, 68),
+        ROW_SUMS,
+        (64, 40, 48, 48, 47, 54, 48),
     ),
     Kernel(
         loss.ssim_derivatives,
