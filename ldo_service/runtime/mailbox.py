@@ -183,11 +183,9 @@ class Mailbox:
             welcome = decode(body, ProducerHello)
         except msgspec.DecodeError as error:
             if self._malformed.is_due():
-                log.warning(
-                    "%s: malformed handshake on %s ignored: %s. Do all programs on this network "
-                    "run the same version?",
-                    self._consumer, inlet.port.topic.name, error,
-                )  # fmt: skip
+                log.warning("%s: malformed handshake on %s ignored: %s. Do all programs on this "
+                            "network run the same version?",
+                            self._consumer, inlet.port.topic.name, error)  # fmt: skip
             return
         start = welcome.starts.get(self._consumer)
         with self._lock:

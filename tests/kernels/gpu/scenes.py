@@ -26,10 +26,12 @@ if os.environ.get("LDO_ISA") != "baseline":
 
 from ldo_service.evaluation import device_iteration  # noqa: E402, F401
 from ldo_service.kernels.gpu import (  # noqa: E402
+    contributions,  # noqa: F401
     descent,  # noqa: F401
     equation_sums,  # noqa: F401
     frame_loss,  # noqa: F401
     plane_rendering,
+    view_rendering,  # noqa: F401
 )
 
 MAX_PAIRS = 150

@@ -8,11 +8,19 @@ import numpy as np
 import pytest
 
 from ldo_service.gaussians.renderer import Rendering, render
-from ldo_service.kernels.gpu import contributions, view_rendering
 from ldo_service.kernels.gpu.arrays import Arrays, HostArray, HostArrays
 from tests.kernels.gpu import agreement
 from tests.kernels.gpu.agreement import check, peak
-from tests.kernels.gpu.scenes import ARRAYS, SCENES, SEAM, Scene, camera_of, plane_rendering
+from tests.kernels.gpu.scenes import (
+    ARRAYS,
+    SCENES,
+    SEAM,
+    Scene,
+    camera_of,
+    contributions,
+    plane_rendering,
+    view_rendering,
+)
 from tests.reference.render import render_reference
 
 ALL = {**SCENES, "batch seam": SEAM}
