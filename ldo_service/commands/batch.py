@@ -144,7 +144,7 @@ def batch(
         workers=workers, threads=threads, memory_gb=memory_gb, max_staged_gb=max_staged_gb
     )
     where = open_store(out)
-    executor = _executor(cluster, RayNeeds(threads, memory_gb, gpus), workers)
+    executor = _executor(cluster, RayNeeds(threads, memory_gb, gpus), workers, device)
     words = [*sources, *(listed(sources_from) if sources_from else ())]
     if not words:
         raise ConfigError("no SOURCES are given. Name recordings, or use --sources-from FILE.")
@@ -184,9 +184,16 @@ def _plan(
     )
 
 
-def _executor(cluster: str | None, needs: RayNeeds, workers: int | None) -> Executor:
+def _executor(
+    cluster: str | None, needs: RayNeeds, workers: int | None, device: str | None
+) -> Executor:
     """Return the executor on a cluster, or on this machine if `cluster` is None."""
     if cluster is not None:
+        if device == "cuda" and not needs.gpus:
+            raise ConfigError(
+                "--device cuda with --cluster needs --gpus, such as --gpus 0.5, because Ray hides "
+                "the GPUs from a task that reserves none."
+            )
         return RayExecutor(cluster, needs, workers)
     if needs.gpus:
         raise ConfigError(

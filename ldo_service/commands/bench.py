@@ -2,6 +2,7 @@
 
 import json
 import os
+import sys
 import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -193,7 +194,10 @@ def bench_gpu_render(verb: BenchRender, camera: Camera, threads: int) -> None:
     try:
         times = device_times(gpu.arrays, verb.gaussians, camera, verb.repeats, threads=threads)
     except DeviceError as error:
-        save_result(msgspec.structs.replace(result, error=str(error)))
+        try:
+            save_result(msgspec.structs.replace(result, error=str(error)))
+        except ConfigError as not_saved:
+            print(f"ldo: {not_saved}", file=sys.stderr)
         raise
     facts = {
         "isa": kernels.isa(),

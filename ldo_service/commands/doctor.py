@@ -224,7 +224,11 @@ def gpus() -> Iterator[Finding]:
     elif result.has_passed:
         yield Finding("ok", f"the GPU {gpu.name} has passed {COMMAND} ({result.scene})")
     else:
-        yield Finding("warn", f"the GPU {gpu.name} has failed {COMMAND}: {result.error}")
+        yield Finding(
+            "warn",
+            f"the GPU {gpu.name} has failed {COMMAND}: {result.error} Until it passes, auto uses "
+            "the CPU. Run it again while no service uses the GPU.",
+        )
 
 
 def networks() -> Iterator[Finding]:

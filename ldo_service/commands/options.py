@@ -53,7 +53,8 @@ Device = Annotated[
     argument(
         metavar="auto|cpu|cuda",
         help="device of mapper, tracker and networks, instead of service.device; auto uses a GPU "
-        "if `ldo bench --device cuda` measured it to be faster (experimental)",
+        "for mapper and tracker where `ldo bench --device cuda` measured it to be faster, and for "
+        "networks if onnxruntime supports one (experimental)",
     ),
 ]
 Source = Annotated[

@@ -6,10 +6,18 @@ from pathlib import Path
 
 import numpy as np
 
-from ldo_service.detection.vocabulary import COCO, canonical, coco_class, normalized, read_names
+from ldo_service.detection.vocabulary import (
+    COCO,
+    answers_to,
+    canonical,
+    coco_class,
+    normalized,
+    read_names,
+)
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry.sequence import VOID_NAMES
 
+COCO_NAME, ALL_NAMES = "COCO", "all names"  # Names of the lists that are always evaluated.
 HERE = Path(__file__).parent / "classes"  # Lists of class names, one file for each list.
 BACKGROUND = "background"
 BUILDING = frozenset({BACKGROUND, "wall", "floor", "ceiling"})  # Names evaluated as background.
@@ -69,7 +77,7 @@ def coco_list(class_names: Iterable[str]) -> LabelSet:
         class_names: Names of the classes of the data set.
     """
     mapped = {coco_class(name) for name in class_names}
-    return LabelSet("COCO", (BACKGROUND, *(n for n in COCO if n in mapped)), _in_coco)
+    return LabelSet(COCO_NAME, (BACKGROUND, *(n for n in COCO if n in mapped)), _in_coco)
 
 
 def full_list(class_names: Iterable[str]) -> LabelSet:
@@ -90,7 +98,7 @@ def full_list(class_names: Iterable[str]) -> LabelSet:
             f"the data set has {len(names)} object names, expected at most {MAX_NAMES}. Merge "
             "some of its classes."
         )
-    return LabelSet("all names", names, object_name)
+    return LabelSet(ALL_NAMES, names, object_name)
 
 
 def known_lists() -> list[str]:
@@ -103,8 +111,8 @@ def load_classes(name: str) -> LabelSet:
 
     Walls, floors and ceilings are background, and collective classes such as `otherprop` are left
     out. Labels of data sets and maps are converted by the table of synonyms. A name that is not in
-    the list is converted to the first class of the list with the same COCO class: "dining table"
-    becomes "table" in `nyu40`.
+    the list is converted to a class of the list with the same COCO class, the first one in the
+    table of synonyms: "dining table" becomes "table". Spaces are ignored.
 
     Args:
         name: Name of a list, such as "nyu40", or path of a text file.
@@ -125,16 +133,23 @@ def load_classes(name: str) -> LabelSet:
             f"{path} has {len(names) - 1} names of objects, must have 1 to {MAX_NAMES - 1}. Remove "
             "or add names."
         )
+    if path.stem in (COCO_NAME, ALL_NAMES):
+        raise ConfigError(
+            f"{path} has the name of a list that is always evaluated. Give it another name."
+        )
+    without_spaces = {name.replace(" ", ""): name for name in names}
     by_coco: dict[str, str] = {}
-    for listed_name in names:
-        if found := coco_class(listed_name):
-            by_coco.setdefault(found, listed_name)
+    for coco_name in dict.fromkeys(map(coco_class, names)):
+        if coco_name is not None:
+            known = (word for word in answers_to(coco_name) if word in names)
+            by_coco[coco_name] = next(known)
 
     def listed_name_of(name: str) -> str:
         plain = canonical(name)
         if plain in BUILDING:
             return BACKGROUND
-        return plain if plain in names else by_coco.get(coco_class(plain) or "", plain)
+        listed = without_spaces.get(plain.replace(" ", ""))
+        return listed or by_coco.get(coco_class(plain) or "", plain)
 
     return LabelSet(path.stem, names, listed_name_of)
 

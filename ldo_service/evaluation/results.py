@@ -123,7 +123,10 @@ def missing_labels(run: FinishedRun, sequence: Sequence) -> str:
     The text is empty if the labels are evaluated. It is also empty if the run has no map, or if
     neither the map nor the source has labels.
     """
-    has_truth = sequence.true_labels() is not None
+    try:
+        has_truth = sequence.true_labels() is not None
+    except DataError as error:
+        return str(error)
     if has_labels(run) and not has_truth:
         return NO_TRUTH
     return NO_LABELS if run.maps and has_truth and not has_labels(run) else ""

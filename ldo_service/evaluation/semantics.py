@@ -40,7 +40,8 @@ true label are ignored. A name of the map that is not in the list is always wron
 COCO: the list of background and the COCO classes of the source, by detection/synonyms.yaml; all
 other classes are background. All names: the list of background (wall, floor, ceiling) and every
 object name of the source; an object with a COCO class has the name of that class. Option --classes:
-the list of background and the classes of a file; pixels of other classes are ignored.
+the list of background and the classes of a file. A class that is not in the list counts as a listed
+class with the same COCO class; pixels of all other classes are ignored.
 mIoU, accuracy and IoU by frequency are means over classes. They are given twice: for the classes
 with more than 0.2 % of the pixels, and for all that occur. Pixel accuracy is over all pixels. Per
 image: mIoU over the classes of a frame, averaged over the frames.

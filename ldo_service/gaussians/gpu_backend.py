@@ -230,6 +230,8 @@ class GpuBackend:
         )
         planes = arrays.download(rendering.planes)
         median_depth_m = arrays.download(view_rendering.median_depth(arrays, rendering))
+        if not (np.isfinite(planes).all() and np.isfinite(median_depth_m).all()):
+            raise DeviceError("the GPU computed NaN or infinity in a rendering")
         color = np.ascontiguousarray(planes[:3].transpose(1, 2, 0))
         made_by = self._contributions(rendering) if contributions else None
         return Rendering(color, planes[3], median_depth_m, planes[4], made_by)

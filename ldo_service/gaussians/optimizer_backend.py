@@ -132,7 +132,9 @@ class CpuBackend:
         self, adam: AdamConfig, weights: LossWeights, limits: ShapeLimits, *, threads: int = 1
     ) -> None:
         self._adam, self._weights, self._limits = Adam(adam), weights, limits
-        self._rasterizer, self._memory = Rasterizer(threads=threads), RenderMemory()
+        # Views are rendered between plans, so both can use the same scratch memory.
+        self._memory = RenderMemory()
+        self._rasterizer = Rasterizer(threads=threads, memory=self._memory)
         self._by_planes = np.empty((5, 0, 0), np.float32)
         self._gaussians: GaussianMap | None = None  # Map between `begin` and `end`.
         self._images = PreparedImages()

@@ -86,8 +86,16 @@ def describe(sequence: Sequence) -> SourceInfo:
         why_unreadable=reasons[0] if reasons else None,
         true_poses=0 if truth is None else len(truth.stamps_s),
         odometry_poses=_odometry_poses(sequence),
-        has_true_labels=sequence.true_labels() is not None,
+        has_true_labels=_has_true_labels(sequence),
     )
+
+
+def _has_true_labels(sequence: Sequence) -> bool:
+    """Return whether the true labels of a source can be read."""
+    try:
+        return sequence.true_labels() is not None
+    except DataError:
+        return False
 
 
 def estimated_run_s(sequence: Sequence, config: Config, frames: int) -> float:

@@ -6,13 +6,15 @@ makes such a folder, it first removes the folders that no process has locked any
 keeps systemd-tmpfiles from removing the files of a service that runs for many days.
 
 Several machines may share the folder of temporary files over a network, where one machine may not
-see the locks of another. The name of a folder therefore contains a part of the boot id of its
-machine, and a process removes only folders with the boot id of its own machine. It also removes
-nothing on a file system that ignores locks.
+see the locks of another. The name of a folder therefore contains a number for its machine, and a
+process removes only folders of its own machine. It also removes nothing on a file system that
+ignores locks.
 """
 
 import fcntl
+import hashlib
 import os
+import platform
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -21,8 +23,9 @@ from pathlib import Path
 
 # Prefix of the folders in the temporary folder; other folders there must not have it.
 PREFIX = "ldo-tmp-"
-# File with a random number of the running kernel, which differs between machines.
-BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+# File with a random number that differs between machines. Containers may have the same one, but
+# have different host names.
+MACHINE_ID = Path("/etc/machine-id")
 
 
 @contextmanager
@@ -48,11 +51,10 @@ def make_temporary_folder() -> tuple[Path, int]:
     Raises:
         OSError: The folder cannot be created.
     """
-    boot_id = _boot_id()
-    if boot_id:
-        _remove_unused(boot_id)
+    prefix = PREFIX + _machine() + "-"
+    _remove_unused(prefix)
     while True:
-        path = Path(tempfile.mkdtemp(prefix=f"{PREFIX}{boot_id}-"))
+        path = Path(tempfile.mkdtemp(prefix=prefix))
         with suppress(FileNotFoundError):  # Another process removed it before it was locked.
             lock = _open(path)
             with suppress(OSError):  # A network file system may not lock folders.
@@ -73,17 +75,17 @@ def _open(path: Path) -> int:
     return os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
 
 
-def _boot_id() -> str:
-    """Return the start of the boot id of this machine; empty if the system has none."""
-    try:
-        return BOOT_ID.read_text()[:8]
-    except OSError:
-        return ""
+def _machine() -> str:
+    """Return eight hexadecimal digits for this machine, which stay the same after a reboot."""
+    known = platform.node().encode()
+    with suppress(OSError):
+        known += MACHINE_ID.read_bytes()
+    return hashlib.sha256(known).hexdigest()[:8]
 
 
-def _remove_unused(boot_id: str) -> None:
+def _remove_unused(prefix: str) -> None:
     """Remove the folders of this user and machine that no process has locked."""
-    for path in Path(tempfile.gettempdir()).glob(f"{PREFIX}{boot_id}-*"):
+    for path in Path(tempfile.gettempdir()).glob(f"{prefix}*"):
         with suppress(OSError):  # The folder belongs to another user, or is in use.
             lock = _open(path)
             try:

@@ -142,8 +142,8 @@ def test_gpu_that_failed_the_benchmark_is_a_warning(
     mapper, _, _, benchmark = doctor.devices()
     assert "chooses cpu (" in mapper.text
     assert benchmark.mark == "warn"
-    assert benchmark.text == (
-        "the GPU Some GPU has failed `ldo bench --device cuda`: the loss differs."
+    assert benchmark.text.startswith(
+        "the GPU Some GPU has failed `ldo bench --device cuda`: the loss differs. Until it passes,"
     )
 
 

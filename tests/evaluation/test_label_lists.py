@@ -117,6 +117,19 @@ def test_names_of_map_and_data_set_become_classes_of_the_list() -> None:
     }
 
 
+@pytest.mark.parametrize("name", ["nyu40", "scannet20", "replica51"])
+def test_table_of_a_detector_is_a_table_in_each_list_and_spaces_are_ignored(name: str) -> None:
+    labels = load_classes(name)
+    found = ("dining table", "shower-curtain")
+    expected = {"dining table": "table"}
+    if name != "replica51":
+        expected["shower-curtain"] = "shower curtain"
+    assert named(labels, labels.of_map(found), found).items() >= expected.items()
+    if name != "scannet20":
+        stands = named(labels, labels.of_map(("nightstand", "night stand")), ("a", "b"))
+        assert stands["a"] == stands["b"] in ("nightstand", "night stand")
+
+
 def test_list_of_a_file_is_read_and_a_missing_one_names_the_known_lists(tmp_path: Path) -> None:
     path = tmp_path / "mine.txt"
     path.write_text("floor\nSofa\ncouch\nfire-extinguisher\n")
@@ -127,3 +140,7 @@ def test_list_of_a_file_is_read_and_a_missing_one_names_the_known_lists(tmp_path
     path.write_text("floor\n")
     with pytest.raises(ConfigError, match="has 0 names of objects"):
         load_classes(str(path))
+    coco = tmp_path / "COCO.txt"
+    coco.write_text("sofa\n")
+    with pytest.raises(ConfigError, match="Give it another name"):
+        load_classes(str(coco))

@@ -54,6 +54,11 @@ class Result:
     violations: list[str] = field(default_factory=list)
 
     @property
+    def not_placed(self) -> set[int]:
+        """Keyframes up to the newest known one that are not in the pose graph."""
+        return set(range(max(self.keyframes | self.placed, default=-1) + 1)) - self.placed
+
+    @property
     def ok_ratio(self) -> float:
         """Fraction of the seconds of the run in which a pose with status OK came."""
         return len(self.ok_seconds) / max(1, int(self.duration_s))
@@ -65,7 +70,7 @@ class Result:
             for k, times in self.deliveries.items()
             if {len(times), self.quarantined.get(k, (0,))[0]} != {MAX_DELIVERIES}
         }
-        missing = self.keyframes - self.placed - self.deliveries.keys()
+        missing = self.not_placed - self.deliveries.keys()
         for is_violated, what in (
             (self.ends, f"the service ended {self.ends} times"),
             (len(self.deliveries) != self.requested, "a request for poison found no keyframe"),
@@ -162,12 +167,12 @@ class PoisonRun:
     def _is_handled(self) -> bool:
         """Return whether all keyframes but those of quarantined messages are in the pose graph.
 
-        The subscriber may have missed keyframes, also those of quarantined messages.
+        The subscriber may have missed keyframes. Their numbers are consecutive.
         """
         result = self.result
         return (
             self._is_quarantined()
-            and result.keyframes - result.placed <= result.deliveries.keys()
+            and result.not_placed == result.deliveries.keys()
             and max(result.placed) > max(result.deliveries, default=-1)
         )
 

@@ -92,6 +92,7 @@ COMMANDS = ("save", "pause", "resume", "reset", "", "RESET", "x" * 5000, "\x1b[2
 # follows the camera, and the mapper gets keyframes of slightly unusual frames.
 RATIOS = (0.005, 0.02, 0.15, 0.5)
 INPUTS_PER_RATIO = 100
+SETTLED_WITHIN_S = 60.0  # The service ends a step after the same time.
 TOPICS = {
     CAMERA_RGBD: 40,
     CAMERA_COLOR: 20,
@@ -357,10 +358,17 @@ class Service:
         return (sum(queued) + frame_source._pairing.waiting_bytes) / 1e6
 
     async def settle(self) -> None:
-        """Wait until the frame source and the tracker have taken all messages."""
+        """Wait until the frame source and the tracker have taken all messages.
+
+        Raises:
+            RuntimeError: A stage has ended, or takes no message for a minute.
+        """
         for stage in self.stages[:2]:
+            until_s = time.monotonic() + SETTLED_WITHIN_S
             while stage._mailbox and stage._mailbox._order and not stage._mailbox.is_held:
                 self.require_running()
+                if time.monotonic() > until_s:
+                    raise RuntimeError(f"{stage.name} takes no message for {SETTLED_WITHIN_S:g} s")
                 await asyncio.sleep(0.0005)
 
     def require_running(self) -> None:

@@ -133,6 +133,27 @@ def test_lens_distortion_is_no_failure_of_the_device(scene: Scene) -> None:
     assert optimizer.device.device == "cuda"
 
 
+class NanArrays(FilledArrays):
+    """Arrays of a device that downloads NaN in the first value of images with some dimensions."""
+
+    def __init__(self, dimensions: int) -> None:
+        self.dimensions = dimensions
+
+    def download(self, array: HostArray) -> np.ndarray:
+        values = super().download(array)
+        if values.ndim == self.dimensions and values.dtype == np.float32:
+            values.flat[0] = np.nan
+        return values
+
+
+@pytest.mark.parametrize("dimensions", [3, 2])
+def test_cpu_repeats_a_rendering_with_nan(scene: Scene, dimensions: int) -> None:
+    """The image planes have three dimensions, and the median depth has two."""
+    optimizer = optimizer_on(NanArrays(dimensions))
+    assert_same_rendering(scene.rendered(optimizer), scene.rendered(GaussianOptimizer(CONFIG)))
+    assert optimizer.device.metrics() == {"device_failed": 1, "on_gpu": 0}
+
+
 def test_rendering_leaves_the_moments_as_they_are(scene: Scene) -> None:
     """Gaussians that are away during a rendering keep their moments."""
     gaussians, optimizer = scene.gaussians, optimizer_on(ARRAYS)

@@ -54,31 +54,24 @@ def test_folder_of_a_killed_process_is_removed_and_that_of_a_running_one_stays()
 def test_folder_of_another_machine_stays_although_its_lock_is_not_visible(
     temporary_files: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "BOOT_ID", temporary_files / "boot_id")
-    for number, (boot_id, is_kept) in enumerate([("0123-5678", True), ("4567-9abc", False)]):
-        module.BOOT_ID.write_text(boot_id)
+    monkeypatch.setattr(module, "MACHINE_ID", temporary_files / "machine_id")
+    for number, (machine_id, is_kept) in enumerate([("0123-5678", True), ("4567-9abc", False)]):
+        module.MACHINE_ID.write_text(machine_id)
         path, lock = module.make_temporary_folder()
         os.close(lock)  # The processes below do not see the lock.
-        module.BOOT_ID.write_text("4567-9abc")
+        module.MACHINE_ID.write_text("4567-9abc")
         with temporary_folder():
             assert path.exists() == is_kept, number
 
 
-def test_nothing_is_removed_if_locks_have_no_effect_or_the_machine_is_unknown(
-    temporary_files: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("temporary_files")
+def test_nothing_is_removed_if_locks_have_no_effect(monkeypatch: pytest.MonkeyPatch) -> None:
     path, lock = module.make_temporary_folder()
     os.close(lock)
     with monkeypatch.context() as patch:
         patch.setattr("fcntl.flock", lambda _descriptor, _operation: None)
         with temporary_folder():
             assert path.exists()
-    with monkeypatch.context() as patch:
-        patch.setattr(module, "BOOT_ID", temporary_files / "absent")
-        with temporary_folder() as first:
-            assert path.exists()
-            with temporary_folder():
-                assert first.exists()
     with temporary_folder():
         assert not path.exists()
 

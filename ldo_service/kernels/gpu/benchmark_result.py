@@ -36,13 +36,16 @@ class BenchmarkResult(msgspec.Struct, frozen=True, kw_only=True):
     def is_faster(self, actor: str) -> bool:
         """Return whether the GPU has passed, and was faster in the step of the given actor."""
         step = STEPS[actor]
-        return self.has_passed and self.gpu_ms[step] < self.cpu_ms[step]
+        nothing = float("inf")
+        return self.has_passed and self.gpu_ms.get(step, nothing) < self.cpu_ms.get(step, nothing)
 
     def text(self, actor: str) -> str:
         """Return a sentence that states the result for the given actor."""
         if self.error:
             return f"{COMMAND} failed on {self.gpu}: {self.error}"
         step = STEPS[actor]
+        if not {step} <= self.gpu_ms.keys() & self.cpu_ms.keys():
+            return f"{COMMAND} has not measured the {step} on {self.gpu}."
         return (
             f"{COMMAND} measured {self.gpu_ms[step]:.2f} ms per {step} on {self.gpu}, and "
             f"{self.cpu_ms[step]:.2f} ms on the CPU ({self.scene})."
@@ -75,6 +78,7 @@ def save_result(result: BenchmarkResult) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         content = msgspec.json.format(msgspec.json.encode([*kept, result]))
         write_atomically(path, content + b"\n", unique=True)
+        path.chmod(0o644)  # The service may run as another user.
     except OSError as error:
         raise ConfigError(
             f"the result cannot be written to {path}: {error.strerror}. Set LDO_CACHE to another "
@@ -89,5 +93,8 @@ def _saved() -> list[BenchmarkResult]:
     except FileNotFoundError:
         return []
     except (OSError, msgspec.MsgspecError, UnicodeDecodeError) as error:
-        log.warning("%s cannot be read: %s. Run %s again.", path, error, COMMAND)
+        log.warning(
+            "%s cannot be read: %s. Make it readable for the user of the service, or delete it and "
+            "run %s again.", path, error, COMMAND,
+        )  # fmt: skip
         return []

@@ -14,7 +14,7 @@ from ldo_service.errors import DeviceError, install_command
 from ldo_service.kernels import isa
 
 from .arrays import Arrays, TorchArrays
-from .benchmark_result import COMMAND, STEPS, BenchmarkResult, saved_result
+from .benchmark_result import COMMAND, STEPS, BenchmarkResult, result_file, saved_result
 
 log = logging.getLogger(__name__)
 
@@ -138,8 +138,8 @@ def _judged(gpu: Gpu, actor: str) -> tuple[bool, str]:
     result = gpu.benchmark()
     if result is None:
         return False, (
-            f"{COMMAND} has not run on {gpu.name} with these versions yet, so the GPU is "
-            "experimental."
+            f"{COMMAND} has not run on {gpu.name} with these versions yet (no result in "
+            f"{result_file()}), so the GPU is experimental."
         )
     return result.is_faster(actor), result.text(actor)
 
