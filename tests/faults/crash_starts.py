@@ -7,11 +7,8 @@ each actor restores its state, and all of them handle the next frames of the cam
 .venv/bin/python -m tests.faults.crash_starts --states 105 --seed 1 --fsync
 """
 
-import argparse
 import asyncio
-import logging
 import random
-import tempfile
 import time
 from collections import Counter
 from contextlib import ExitStack
@@ -26,7 +23,7 @@ from ldo_service.service.state_folder import claim_state
 from ldo_service.storage.state_store import FolderStore
 from tests.runtime.fake_actors import eventually
 
-from .crash_states import keyframes_of, record_run
+from .crash_states import keyframes_of, recorded_run
 from .disk_log import CrashState, DiskLog, crash_state
 from .small_service import ACTORS, SmallService, open_service
 
@@ -156,20 +153,10 @@ async def start_all(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--states", type=int, default=105)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--frames", type=int, default=10)
-    parser.add_argument("--fsync", action="store_true")
-    given = parser.parse_args()
-    logging.getLogger().addHandler(logging.NullHandler())
-    with tempfile.TemporaryDirectory() as name:
-        run = Path(name) / "run"
-        run.mkdir()
-        log = asyncio.run(record_run(run, given.frames, syncs=given.fsync))
+    with recorded_run(__doc__, states=105, frames=10) as (given, folder, log):
         began_s = time.process_time()
         states = power_cuts(log, given.states, given.seed)
-        starts, failed = asyncio.run(start_all(states, Path(name), syncs=given.fsync))
+        starts, failed = asyncio.run(start_all(states, folder, syncs=given.fsync))
     lost = Counter(start.lost_keyframes for start in starts)
     for keyframes, count in sorted(lost.items()):
         print(f"{keyframes} keyframes lost: {count}")

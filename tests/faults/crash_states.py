@@ -12,8 +12,8 @@ import shutil
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterable
-from contextlib import ExitStack
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from unittest.mock import patch
 
@@ -133,20 +133,37 @@ def lost_keyframes(
     return lost, failed
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--states", type=int, default=10_000)
+@contextmanager
+def recorded_run(
+    description: str | None, states: int, frames: int
+) -> Iterator[tuple[argparse.Namespace, Path, DiskLog]]:
+    """Parse the options of a program, and record a run of all actors.
+
+    Args:
+        description: Description of the program.
+        states: Default number of power cuts.
+        frames: Default number of frames of the run.
+
+    Yields:
+        The options, a temporary folder, and the log of the run.
+    """
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--states", type=int, default=states)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--frames", type=int, default=16)
+    parser.add_argument("--frames", type=int, default=frames)
     parser.add_argument("--fsync", action="store_true")
     given = parser.parse_args()
     logging.getLogger().addHandler(logging.NullHandler())
     with tempfile.TemporaryDirectory() as name:
         run = Path(name) / "run"
         run.mkdir()
-        log = asyncio.run(record_run(run, given.frames, syncs=given.fsync))
+        yield given, Path(name), asyncio.run(record_run(run, given.frames, syncs=given.fsync))
+
+
+def main() -> None:
+    with recorded_run(__doc__, states=10_000, frames=16) as (given, folder, log):
         started_s = time.monotonic()
-        lost, failed = lost_keyframes(log, given.states, given.seed, Path(name) / "copy")
+        lost, failed = lost_keyframes(log, given.states, given.seed, folder / "copy")
     limit = 0 if given.fsync else 5
     print(f"{len(log.changes)} changes of {max(c.note or 0 for c in log.changes)} keyframes")
     for keyframes, count in sorted(lost.items()):
