@@ -30,6 +30,7 @@ from .planes import (
     Planes,
     compute_depth_features,
     disc,
+    dot,
     planes,
     shrink_factor,
     structural_planes,
@@ -122,6 +123,8 @@ def segment_geometry(
 
 def components(mask: np.ndarray, min_px: int = 1) -> Iterator[Foreground]:
     """Yield each 4-connected component of a mask, [H, W] bool, of at least `min_px` pixels."""
+    if not mask.any():
+        return
     count, parts, boxes, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     for part in range(1, count):
         column, row, width, height, area = (int(value) for value in boxes[part])
@@ -159,8 +162,8 @@ def _concave(seen: DepthFeatures, config: GeometricSegmentationConfig) -> np.nda
     r, concave = config.crease_px, np.zeros(seen.inverse.shape, bool)
     for axis, inner in ((1, np.s_[:, r:-r]), (0, np.s_[r:-r])):
         turn, along = (_across(values, r, axis) for values in (seen.normals, points))
-        is_sharp = np.linalg.norm(turn, axis=-1) > config.crease
-        concave[inner] |= is_sharp & ((turn * along).sum(axis=-1) < 0)
+        is_sharp = np.sqrt(dot(turn, turn)) > config.crease
+        concave[inner] |= is_sharp & (dot(turn, along) < 0)
     return concave
 
 
@@ -223,7 +226,8 @@ def _steps(lab: np.ndarray) -> np.ndarray:
     smooth = cv2.GaussianBlur(lab, (0, 0), 1.0)
     across = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
     down = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
-    return np.sqrt((across * across + down * down).sum(axis=-1))
+    change = across * across + down * down
+    return np.sqrt(change[..., 0] + change[..., 1] + change[..., 2])
 
 
 def _of_plane(even: np.ndarray, lab: np.ndarray, config: GeometricSegmentationConfig) -> np.ndarray:
@@ -245,7 +249,14 @@ def _of_plane(even: np.ndarray, lab: np.ndarray, config: GeometricSegmentationCo
     if len(large) == 0:
         return even
     weight = np.array([0.5, 1, 1], np.float32)
-    colors = {int(k): np.median(lab[parts == k], axis=0) * weight for k in large}
+    pixels = np.flatnonzero(parts)
+    pixels = pixels[np.argsort(parts.ravel()[pixels], kind="stable")]  # Sorted by component.
+    ends = np.cumsum(sizes)
+    of_pixel = lab.reshape(-1, 3)
+    colors = {
+        int(k): np.median(of_pixel[pixels[ends[k] - sizes[k] : ends[k]]], axis=0) * weight
+        for k in large
+    }
     most = colors[int(sizes.argmax())]
     is_same = np.zeros(count, bool)
     is_same[[p for p, c in colors.items() if np.linalg.norm(c - most) < config.color_gap]] = True
