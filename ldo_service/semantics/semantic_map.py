@@ -16,7 +16,7 @@ from ldo_service.regions.open_vocabulary import OpenVocabularyLabeling
 from ldo_service.regions.region import Region, RegionLabelResult
 
 from .data_association import MapView
-from .gaussian_labels import BACKGROUND, Disagreement, top_labels
+from .gaussian_labels import Disagreement, count_labelled
 from .objects import Objects
 from .observations import KeyframeSemantics
 from .semantic_fusion import (
@@ -373,11 +373,9 @@ class SemanticMap:
         The two `label_disagreement` metrics are sums over the Gaussians of the newest labelled
         keyframe; see `gaussian_labels.Disagreement`.
         """
-        labelled = 0
-        if self._boxes:
-            labelled = int(np.count_nonzero(top_labels(self._map.gaussians.labels) != BACKGROUND))
         return {
-            "gaussians_labelled": labelled,  # Resident Gaussians only.
+            # Resident Gaussians only.
+            "gaussians_labelled": count_labelled(self._map.gaussians.labels) if self._boxes else 0,
             "keyframes_labelled": self._labelled,
             "boxes": self._boxes,
             "boxes_repeated": self._repeated,  # Messages repeated after a restart.

@@ -19,6 +19,7 @@ from ldo_service.semantics.gaussian_labels import (
     LabelConfig,
     Observations,
     background,
+    count_labelled,
     distribution,
     entropy,
     fields,
@@ -244,3 +245,16 @@ def test_distribution_raises_for_label_above_class_count() -> None:
     with pytest.raises(ValueError, match="must be below 82"):
         distribution(labels, 82)
     assert background(labels)[0] == 0
+
+
+def test_fast_background_and_count_equal_plain_sums() -> None:
+    rng = np.random.default_rng(4)
+    weights = rng.random((5000, 5), np.float32)
+    weights *= rng.uniform(0, 1.2, (5000, 1)).astype(np.float32) / weights.sum(1, keepdims=True)
+    labels = new_labels(len(weights))
+    fields(labels)["weights"] = -np.sort(-weights, axis=1)
+    fields(labels)["ids"] = 7
+    plain = np.maximum(1 - fields(labels)["weights"].sum(axis=1), 0)
+    assert np.array_equal(background(labels), plain)
+    assert 0 < count_labelled(labels) < len(labels)
+    assert count_labelled(labels) == np.count_nonzero(top_labels(labels))
