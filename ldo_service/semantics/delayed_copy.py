@@ -129,17 +129,24 @@ class GaussianLabels:
         labels back. The block must not add Gaussians to the map, remove them, or load them from
         disk.
         """
-        shown, ids = gaussians.labels.copy(), gaussians.ids.copy()
+        shown = gaussians.labels.copy()
         gaussians.labels[:] = self._of(gaussians)
         try:
             yield
-            absent = ~np.isin(self.ids, ids, assume_unique=True)
-            all_ids = np.concatenate([ids, self.ids[absent]])
-            order = np.argsort(all_ids)
-            self.labels = np.concatenate([gaussians.labels, self.labels[absent]])[order]
-            self.ids = all_ids[order]
+            self._store(gaussians)
         finally:
             gaussians.labels[:] = shown
+
+    def _store(self, gaussians: GaussianMap) -> None:
+        """Store the labels of those Gaussians of a map that are in memory."""
+        if np.array_equal(self.ids, gaussians.ids):
+            self.labels = gaussians.labels.copy()  # A saved state may refer to the old array.
+            return
+        absent = ~np.isin(self.ids, gaussians.ids, assume_unique=True)
+        ids = np.concatenate([gaussians.ids, self.ids[absent]])
+        order = np.argsort(ids)
+        self.labels = np.concatenate([gaussians.labels, self.labels[absent]])[order]
+        self.ids = ids[order]
 
     def write(self, gaussians: GaussianMap) -> np.ndarray:
         """Write the labels into a map, and return the indices of the changed rows.
@@ -155,8 +162,10 @@ class GaussianLabels:
         """Return the label rows of the N Gaussians of a map that are in memory, [N, 32] uint8.
 
         A Gaussian that is newer than this copy gets no label. A Gaussian that was on disk when the
-        copy was made keeps its label in the map.
+        copy was made keeps its label in the map. The caller must not change the returned rows.
         """
+        if np.array_equal(self.ids, gaussians.ids):
+            return self.labels
         labels, ids = gaussians.labels.copy(), gaussians.ids
         if len(self.ids) == 0:
             labels[ids >= self.next_id] = 0
