@@ -350,12 +350,12 @@ class Mapper(Actor):
     def snapshot(self) -> dict[str, Any]:
         """Return the last checkpoint of the map.
 
-        The checkpoint stays the same object until the next one is due, `checkpoint_keyframes`
-        keyframes later.
+        The checkpoint stays the same object until the next one is due; see
+        `MapperConfig.checkpoint_interval`.
         """
         newest = self._newest[1]
-        saved = self._checkpoint["newest"][1] if self._checkpoint else None
-        is_due = saved is None or newest - saved >= self.config.checkpoint_keyframes
+        saved = self._checkpoint["newest"][1] if self._checkpoint else -UNLIMITED
+        is_due = newest - saved >= self.config.checkpoint_interval(len(self._map.gaussians))
         if newest >= 0 and is_due:
             self._take_checkpoint()
         return {"map": self._checkpoint} if self._checkpoint else {}

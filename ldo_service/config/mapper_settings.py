@@ -194,8 +194,9 @@ class MapperSettings:
     # Threads of the renderer. 0 uses as many as there are cores. The threads of the tracker have a
     # higher priority.
     threads: NonNegativeInt = 0
-    # Number of keyframes between checkpoints of the map. After a crash, up to this many keyframes
-    # are mapped again.
+    # Minimum number of keyframes between checkpoints of the map. A map of more than 100,000
+    # Gaussians has one keyframe more for each 20,000 Gaussians. After a crash, up to this many
+    # keyframes are mapped again.
     checkpoint_interval_keyframes: PositiveInt = 5
     # Folder of the keyframe images. Empty uses the state folder, or a temporary folder
     # if there is no state folder.

@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from ldo_service.actors import mapper_config
 from ldo_service.actors.mapper import Mapper
 from ldo_service.actors.mapper_config import MapperConfig
 from ldo_service.actors.optimizer import Optimizer
@@ -718,3 +719,14 @@ def test_restored_mapper_keeps_labels_and_ignores_repeated_detections(keyframes,
     assert ends[0].map.labels.tobytes() == ends[1].map.labels.tobytes()
     assert ends[0].label_names == ends[1].label_names
     assert top_labels(ends[0].map.labels).any()
+
+
+def test_checkpoints_of_a_large_map_are_farther_apart(keyframes, monkeypatch) -> None:
+    assert MapperConfig().checkpoint_interval(100_000) == 5
+    assert MapperConfig().checkpoint_interval(300_000) == 15
+    monkeypatch.setattr(mapper_config, "GAUSSIANS_PER_KEYFRAME", 1)
+    mapper = Mapper(SLOW_CHECKPOINTS)
+    handle_all(mapper, keyframes[:1])
+    first = mapper.snapshot()["map"]
+    handle_all(mapper, keyframes[1:7])
+    assert mapper.snapshot()["map"] is first
