@@ -82,6 +82,11 @@ class Network:
         return [(node.name, node.type, list(node.shape)) for node in self._session.get_inputs()]
 
     @property
+    def outputs(self) -> list[str]:
+        """Name of each output, in the order of `run`."""
+        return [node.name for node in self._session.get_outputs()]
+
+    @property
     def metadata(self) -> dict[str, str]:
         """Metadata that the exporter of the network wrote into the file.
 
