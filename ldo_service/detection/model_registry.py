@@ -45,13 +45,14 @@ EMBEDDINGS = ("embeddings.npz", "embeddings.safetensors", "text_embeddings.npz")
 # File names of the image encoder in a folder that is not registered, by preference.
 IMAGES = (FILE, "image_encoder.onnx")
 CLIP = "clip"  # Value of `ModelInfo.layout` for a pair of encoders.
+SENTENCE = "sentence"  # Value of `ModelInfo.layout` for a sentence encoder (`sentence_models`).
 
 
 class ModelInfo(msgspec.Struct, frozen=True, kw_only=True):
     """Description of a registered network, as stored in about.json."""
 
     sha256: str  # Checksum of model.onnx, hexadecimal.
-    layout: str  # Layout of the detector, see `yolo`, or "clip" for a pair of encoders.
+    layout: str  # Layout of the detector, see `yolo`, or "clip" or "sentence".
     classes: tuple[str, ...]  # Names of the classes, or of the labels of a labeller.
     license: str = ""  # Text of the license; empty if not stated.
     source: str = ""  # Name of the file that was copied.
@@ -65,6 +66,13 @@ class Model:
     name: str
     folder: Path
     about: ModelInfo
+
+    @property
+    def summary(self) -> str:
+        """Layout and number of classes; "sentence encoder" for a sentence encoder."""
+        if self.about.layout == SENTENCE:
+            return "sentence encoder"
+        return f"{self.about.layout}, {len(self.about.classes)} classes"
 
     @property
     def file(self) -> Path:
@@ -109,7 +117,7 @@ class Models:
             ConfigError: If the name is invalid or taken, or the folder cannot be written.
             ModelError: If the file cannot be used as a detector.
         """
-        return self._add(name, [file], lambda folder: _fill(folder, file, config, license))
+        return self.register(name, [file], lambda folder: _fill(folder, file, config, license))
 
     def add_pair(
         self,
@@ -134,11 +142,19 @@ class Models:
             ModelError: If the files cannot be used as a pair.
         """
         files = [file for file in (pair.image, pair.text, pair.vocabulary, pair.embeddings) if file]
-        return self._add(
+        return self.register(
             name, files, lambda folder: _fill_pair(folder, pair, config, names, license)
         )
 
-    def _add(self, name: str, files: Sequence[Path], fill: Callable[[Path], ModelInfo]) -> Model:
+    def register(
+        self, name: str, files: Sequence[Path], fill: Callable[[Path], ModelInfo]
+    ) -> Model:
+        """Add a model whose folder `fill` makes from `files`; a failure leaves no files behind.
+
+        Raises:
+            ConfigError: If the name is invalid or taken, or the folder cannot be written.
+            ModelError: If a file does not exist, or `fill` rejects it.
+        """
         _require_name(name)
         if (self.folder / name).exists():
             raise ConfigError(
@@ -257,6 +273,8 @@ def open_detector(model: str, config: NetworkConfig) -> OnnxDetector:
         raise ModelError(
             f"{model} is a pair of encoders: set it as vlm_labeller.model, not detector.model."
         )
+    if found.about.layout == SENTENCE:
+        raise ModelError(f"{model} is a sentence encoder, for `ldo query` only: set a detector.")
     settings = replace(config, layout=config.layout or found.about.layout)
     return OnnxDetector(found.file, settings, found.about.classes, name=model)
 
@@ -290,6 +308,10 @@ def open_labeller(model: str, config: DualEncoderConfig, names: Sequence[str] = 
         return DualEncoder(_pair_in(folder), config, names, name=folder.name)
     found = models.get(model)
     found.verify()
+    if found.about.layout == SENTENCE:
+        raise ModelError(
+            f"{model} is a sentence encoder, for `ldo query` only: set an encoder pair."
+        )
     if found.about.layout != CLIP:
         raise ModelError(
             f"{model} is a detector ({found.about.layout}): set it as detector.model, not "

@@ -151,7 +151,11 @@ def _inputs_of(network: Network) -> tuple[dict[str, type[np.integer]], int | Non
     fixed = {length for length in lengths if isinstance(length, int)}
     fits = {TOKENS, MASK} <= kinds.keys() <= {TOKENS, MASK, SEGMENTS}
     fits = fits and all(kind in _KINDS for kind in kinds.values()) and len(fixed) <= 1
-    if not fits or any(len(shape) != 2 for *_, shape in network.inputs) or min(fixed, default=3) < 3:
+    if (
+        not fits
+        or any(len(shape) != 2 for *_, shape in network.inputs)
+        or min(fixed, default=3) < 3
+    ):
         found = ", ".join(f"{name} {kind} {shape}" for name, kind, shape in network.inputs)
         raise ModelError(f"the network's inputs are {found}. {_EXPECTED}")
     return {name: _KINDS[kind] for name, kind in kinds.items()}, next(iter(fixed), None)

@@ -6,7 +6,13 @@ import numpy as np
 
 from ldo_service.errors import DataError
 from ldo_service.schemas import MapObjects, Pose
-from ldo_service.semantics.text_search import Encode, TextComparisonError, search, suggest_names
+from ldo_service.semantics.text_search import (
+    MIN_COSINE,
+    Encode,
+    TextComparisonError,
+    search,
+    suggest_names,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +31,11 @@ class ObjectMatch:
 
 
 def find_objects(
-    text: str, found: MapObjects, eye: np.ndarray | None, encode: Encode | None = None
+    text: str,
+    found: MapObjects,
+    eye: np.ndarray | None,
+    encode: Encode | None = None,
+    min_cosine: float = MIN_COSINE,
 ) -> list[ObjectMatch]:
     """Return the objects that match a text, the best match first.
 
@@ -37,13 +47,14 @@ def find_objects(
         found: The objects of the map.
         eye: Camera position in the map frame, [3], meters; None if unknown.
         encode: Text encoder; None compares names and synonyms only.
+        min_cosine: Minimum cosine of similar texts, which depends on the text encoder.
 
     Raises:
         DataError: No object matches.
     """
     names = [one.name for one in found.objects]
     try:
-        hits, why_not = _ranked(text, found, encode), ""
+        hits, why_not = _ranked(text, found, encode, min_cosine), ""
     except TextComparisonError as error:
         hits = []
         why_not = f" Names of similar meaning were not searched: {error}"
@@ -69,7 +80,9 @@ def matching_objects(
     return _sorted([_match(found, index, score, eye) for index, score in hits])
 
 
-def _ranked(text: str, found: MapObjects, encode: Encode | None) -> list[tuple[int, float]]:
+def _ranked(
+    text: str, found: MapObjects, encode: Encode | None, min_cosine: float = MIN_COSINE
+) -> list[tuple[int, float]]:
     """Return index and score of the objects that match a text.
 
     Raises:
@@ -78,7 +91,7 @@ def _ranked(text: str, found: MapObjects, encode: Encode | None) -> list[tuple[i
     named = [dict(one.distribution) for one in found.objects]
     hits = search(text, named)
     if not hits and named and encode is not None:
-        hits = search(text, named, encode)
+        hits = search(text, named, encode, min_cosine)
     return [(hit.index, hit.score) for hit in hits]
 
 

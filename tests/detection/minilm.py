@@ -43,9 +43,7 @@ def write_minilm(weights: Path, path: Path) -> Path:
     # Padding gets a score of -10,000 before the softmax.
     shape = graph.constant([0, 1, 1, -1])
     mask = graph.node("Cast", graph.node("Reshape", "attention_mask", shape), to=TensorProto.FLOAT)
-    penalty = graph.node(
-        "Mul", graph.node("Sub", graph.number(1), mask), graph.number(-10_000)
-    )
+    penalty = graph.node("Mul", graph.node("Sub", graph.number(1), mask), graph.number(-10_000))
     for number in range(LAYERS):
         hidden = graph.layer(hidden, penalty, f"encoder.layer.{number}")
     graph.nodes.append(helper.make_node("Identity", [hidden], ["last_hidden_state"]))
@@ -100,11 +98,10 @@ class _Graph:
     def layer(self, hidden: str, penalty: str, name: str) -> str:
         """Add one layer of the transformer: attention, and then two dense layers."""
         query, key, value = (
-            self.linear(hidden, f"{name}.attention.self.{part}") for part in ("query", "key", "value")
+            self.linear(hidden, f"{name}.attention.self.{part}")
+            for part in ("query", "key", "value")
         )
-        scores = self.node(
-            "MatMul", self.heads(query, [0, 2, 1, 3]), self.heads(key, [0, 2, 3, 1])
-        )
+        scores = self.node("MatMul", self.heads(query, [0, 2, 1, 3]), self.heads(key, [0, 2, 3, 1]))
         scaled = self.node("Mul", scores, self.number((WIDTH // HEADS) ** -0.5))
         shares = self.node("Softmax", self.node("Add", scaled, penalty), axis=-1)
         context = self.node("MatMul", shares, self.heads(value, [0, 2, 1, 3]))

@@ -1,0 +1,106 @@
+"""Registered sentence encoders, which compare the text of a query with names of objects.
+
+<folder>/<name>/model.onnx                     copy of the network
+<folder>/<name>/tokenizer.json or vocab.txt    copy of its tokenizer
+"""
+
+import shutil
+from pathlib import Path
+
+import msgspec
+
+from ldo_service.errors import ConfigError, ModelError
+
+from .model_registry import ABOUT, FILE, SENTENCE, Model, ModelInfo, Models
+from .onnx_network import sha256
+from .sentence_encoder import SentenceEncoder
+
+TOKENIZER_JSON, TOKENIZER_TEXT = "tokenizer.json", "vocab.txt"
+
+
+def add_sentence_encoder(
+    models: Models, name: str, file: Path, tokenizer: Path, license: str = ""
+) -> Model:
+    """Copy a sentence encoder into the registry; a failure leaves no files behind.
+
+    Args:
+        models: The registry.
+        name: Name of the model.
+        file: The network in ONNX.
+        tokenizer: File of its tokenizer.
+        license: Text of the license; empty if unknown.
+
+    Raises:
+        ConfigError: If the name is invalid or taken, or the folder cannot be written.
+        ModelError: If the files cannot be used as a sentence encoder.
+    """
+
+    def fill(folder: Path) -> ModelInfo:
+        SentenceEncoder(file, tokenizer)
+        part = TOKENIZER_JSON if tokenizer.suffix == ".json" else TOKENIZER_TEXT
+        folder.mkdir()
+        shutil.copyfile(file, folder / FILE)
+        shutil.copyfile(tokenizer, folder / part)
+        about = ModelInfo(
+            sha256=sha256(folder / FILE),
+            layout=SENTENCE,
+            classes=(),
+            license=license,
+            source=file.name,
+            parts={part: sha256(folder / part)},
+        )
+        (folder / ABOUT).write_bytes(msgspec.json.format(msgspec.json.encode(about), indent=1))
+        return about
+
+    return models.register(name, [file, tokenizer], fill)
+
+
+def sentence_encoders(models: Models) -> list[str]:
+    """Return the names of the registered sentence encoders, sorted."""
+    found = []
+    for name in models.names:
+        try:
+            if models.get(name).about.layout == SENTENCE:
+                found.append(name)
+        except ModelError:
+            continue  # `ldo models list` and `ldo doctor` report the damaged description.
+    return found
+
+
+def open_sentence_encoder(models: Models, name: str) -> SentenceEncoder:
+    """Open a registered sentence encoder.
+
+    Raises:
+        ConfigError: If the name is not registered.
+        ModelError: If the model is damaged or is not a sentence encoder.
+    """
+    model = models.get(name)
+    model.verify()
+    parts = [part for part in (TOKENIZER_JSON, TOKENIZER_TEXT) if part in model.about.parts]
+    if model.about.layout != SENTENCE or not parts:
+        raise ModelError(
+            f"{name} is not a sentence encoder but {model.about.layout}: choose another model."
+        )
+    return SentenceEncoder(model.file, model.folder / parts[0])
+
+
+def sentence_encoder_to_use(models: Models, wanted: str) -> str:
+    """Return the name of the sentence encoder for a query; empty if none applies.
+
+    Args:
+        models: The registry.
+        wanted: Name that the user chose, which may be an encoder pair; empty: the only registered
+            sentence encoder.
+
+    Raises:
+        ConfigError: If several are registered and none was chosen.
+    """
+    found = sentence_encoders(models)
+    if wanted:
+        return wanted if wanted in found else ""
+    if len(found) > 1:
+        raise ConfigError(
+            f"several sentence encoders are registered: {', '.join(found)}. Choose one with "
+            "`--model NAME`."
+        )
+    return found[0] if found else ""

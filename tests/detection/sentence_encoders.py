@@ -1,0 +1,49 @@
+"""Tiny sentence encoder whose token vectors come from a table."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+# Vectors of words; a chair is nearest to sitting, and a piano to nothing.
+WORDS = {"chair": (1, 0.1, 0), "couch": (0.8, 0.6, 0), "sit": (1, 0, 0), "piano": (0, 0, 1)}
+SPECIAL = ("[PAD]", "[UNK]", "[CLS]", "[SEP]")
+
+
+@dataclass(frozen=True)
+class TinyEncoder:
+    """Network and vocabulary; the fields describe valid variants and defects of the files."""
+
+    inputs: tuple[str, ...] = ("input_ids", "attention_mask", "token_type_ids")
+    length: int | str = "L"
+    integer: int = TensorProto.INT64
+    is_pooled: bool = False  # The output is [1, D], of the name `output`.
+    output: str = "last_hidden_state"
+
+    def network(self, path: Path) -> Path:
+        table = np.zeros((len(SPECIAL) + len(WORDS), 3), np.float32)
+        table[0] = 100  # A padding that is not masked changes the result.
+        table[len(SPECIAL) :] = tuple(WORDS.values())
+        nodes = [helper.make_node("Gather", ["table", self.inputs[0]], ["hidden"])]
+        if self.is_pooled:
+            nodes.append(helper.make_node("ReduceMax", ["hidden"], ["out"], axes=[1], keepdims=0))
+        else:
+            nodes.append(helper.make_node("Identity", ["hidden"], ["out"]))
+        nodes.append(helper.make_node("Identity", ["out"], [self.output]))
+        inputs = [
+            helper.make_tensor_value_info(name, self.integer, ["N", self.length])
+            for name in self.inputs
+        ]
+        outputs = [helper.make_tensor_value_info(self.output, TensorProto.FLOAT, None)]
+        values = [numpy_helper.from_array(table, "table")]
+        graph = helper.make_graph(nodes, "tiny", inputs, outputs, values)
+        opset = [helper.make_opsetid("", 13)]
+        onnx.save(helper.make_model(graph, ir_version=8, opset_imports=opset), path)
+        return path
+
+
+def write_vocabulary(path: Path) -> Path:
+    path.write_text("\n".join((*SPECIAL, *WORDS)) + "\n")
+    return path
