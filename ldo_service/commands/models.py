@@ -166,13 +166,24 @@ def _add_sentence_encoder(verb: AddModel, tokenizer: Path) -> Model:
 
 def _add_detector(verb: AddModel) -> Model:
     file = verb.file.expanduser()
-    if file.is_file() and any(name == TOKENS for name, *_ in Network(file).inputs):
-        raise ConfigError(
-            f"{file} is a network for texts. Give the tokenizer.json or vocab.txt of a sentence "
-            "encoder with `--tokenizer FILE`."
-        )
     config = NetworkConfig(layout=verb.layout or "", names=verb.names)
-    return Models().add(verb.name, verb.file.expanduser(), config, _license(verb.license))
+    try:
+        return Models().add(verb.name, file, config, _license(verb.license))
+    except ModelError as error:
+        if _takes_tokens(file):
+            raise ConfigError(
+                f"{file} is a network for texts. Give the tokenizer.json or vocab.txt of a "
+                "sentence encoder with `--tokenizer FILE`."
+            ) from error
+        raise
+
+
+def _takes_tokens(file: Path) -> bool:
+    """Return whether a file is a network whose inputs are tokens of texts."""
+    try:
+        return any(name == TOKENS for name, *_ in Network(file).inputs)
+    except ModelError:
+        return False
 
 
 def _add_pair(verb: AddModel) -> Model:

@@ -16,11 +16,9 @@ from ldo_service.client import connect
 from ldo_service.config import actor_parameters, load_config
 from ldo_service.conversions.poses import pose_from_message
 from ldo_service.detection.labellers.dual_encoder import DualEncoderConfig
-from ldo_service.detection.model_registry import Models, open_labeller
-from ldo_service.detection.sentence_models import (
-    open_sentence_encoder,
-    sentence_encoder_to_use,
-)
+from ldo_service.detection.model_registry import Models
+from ldo_service.detection.open_networks import open_labeller
+from ldo_service.detection.sentence_models import open_sentence_encoder, sentence_encoders
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Trajectory
 from ldo_service.maps.object_search import ObjectMatch, find_objects
@@ -29,9 +27,9 @@ from ldo_service.schemas import MapObjects, TrackedPose
 from ldo_service.schemas.topics import POSE_TRACKED
 from ldo_service.semantics.text_search import (
     MIN_COSINE,
-    MIN_SENTENCE_COSINE,
     Encode,
     TextComparisonError,
+    TextEncoder,
 )
 from ldo_service.transport.zenoh_transport import DEFAULT_ENDPOINT
 
@@ -73,8 +71,8 @@ def query(
     """
     is_live = where == LIVE
     found, eye = _live(robot, endpoint, keys) if is_live else _of_run(Path(where).expanduser())
-    encode, min_cosine = _encoder(model, None if is_live else Path(where).expanduser())
-    answers = find_objects(text, found, eye, encode, min_cosine)
+    encoder = _encoder(model, None if is_live else Path(where).expanduser())
+    answers = find_objects(text, found, eye, encoder)
     if json_:
         print(json.dumps([_plain(one) for one in answers]))
     else:
@@ -107,8 +105,8 @@ def _live(robot: str, endpoint: str, keys: Path | None) -> tuple[MapObjects, np.
     return found, eye
 
 
-def _encoder(model: str, run: Path | None) -> tuple[Encode, float]:
-    """Return the text encoder of a query, and the minimum cosine of texts of similar meaning.
+def _encoder(model: str, run: Path | None) -> TextEncoder:
+    """Return the text encoder of a query.
 
     Args:
         model: Name of a sentence encoder or of an encoder pair; empty to use the only registered
@@ -116,27 +114,24 @@ def _encoder(model: str, run: Path | None) -> tuple[Encode, float]:
         run: Folder of the run; None for a live service.
     """
     models = Models()
-    try:
-        name = sentence_encoder_to_use(models, model)
-    except ConfigError as error:
-        reason = str(error)
-
-        def refuse(_: Sequence[str]) -> np.ndarray:
-            raise TextComparisonError(reason)
-
-        return refuse, MIN_COSINE
-    if not name:
-        return _texts_of(model, run), MIN_COSINE
+    found = sentence_encoders(models)
+    if model not in found and (model or not found):
+        return TextEncoder(_texts_of(model, run), MIN_COSINE)
 
     def encode(texts: Sequence[str]) -> np.ndarray:
+        if model:
+            return open_sentence_encoder(models, model).encode(texts)
+        if len(found) > 1:
+            raise TextComparisonError(
+                f"several sentence encoders are registered: {', '.join(found)}. Choose one with "
+                "`--model NAME`."
+            )
         try:
-            return open_sentence_encoder(models, name).encode(texts)
+            return open_sentence_encoder(models, found[0]).encode(texts)
         except ConfigError as error:
-            if model:
-                raise
             raise TextComparisonError(str(error)) from error
 
-    return encode, MIN_SENTENCE_COSINE
+    return TextEncoder(encode)
 
 
 def _texts_of(model: str, run: Path | None) -> Encode:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import msgspec
 
-from ldo_service.errors import ConfigError, ModelError
+from ldo_service.errors import ModelError
 
 from .model_registry import ABOUT, FILE, SENTENCE, Model, ModelInfo, Models
 from .onnx_network import sha256
@@ -82,25 +82,3 @@ def open_sentence_encoder(models: Models, name: str) -> SentenceEncoder:
             f"{name} is not a sentence encoder but {model.about.layout}: choose another model."
         )
     return SentenceEncoder(model.file, model.folder / parts[0])
-
-
-def sentence_encoder_to_use(models: Models, wanted: str) -> str:
-    """Return the name of the sentence encoder for a query; empty if none applies.
-
-    Args:
-        models: The registry.
-        wanted: Name that the user chose, which may be an encoder pair; empty: the only registered
-            sentence encoder.
-
-    Raises:
-        ConfigError: If several are registered and none was chosen.
-    """
-    found = sentence_encoders(models)
-    if wanted:
-        return wanted if wanted in found else ""
-    if len(found) > 1:
-        raise ConfigError(
-            f"several sentence encoders are registered: {', '.join(found)}. Choose one with "
-            "`--model NAME`."
-        )
-    return found[0] if found else ""

@@ -7,7 +7,8 @@ import pytest
 from ldo_service.commands import doctor
 from ldo_service.detection.detectors import NetworkConfig
 from ldo_service.detection.labellers.dual_encoder import DualEncoderConfig
-from ldo_service.detection.model_registry import Models, open_detector, open_labeller
+from ldo_service.detection.model_registry import Models
+from ldo_service.detection.open_networks import open_detector, open_labeller
 from ldo_service.errors import ModelError
 from tests.commands.test_cli import assert_one_paragraph, ldo
 from tests.detection.labellers.encoders import ColorPair, vocabulary
