@@ -8,6 +8,7 @@ import shutil
 from pathlib import Path
 
 import msgspec
+import numpy as np
 
 from ldo_service.errors import ModelError
 
@@ -16,6 +17,11 @@ from .onnx_network import sha256
 from .sentence_encoder import SentenceEncoder
 
 TOKENIZER_JSON, TOKENIZER_TEXT = "tokenizer.json", "vocab.txt"
+# Names with a synonym of each. With a tokenizer of another network, tokens get the wrong vectors,
+# and the synonym of a name is not nearest to it.
+SYNONYMS = {"couch": "sofa", "bicycle": "bike", "airplane": "aeroplane", "cup": "mug"}
+SYNONYMS |= {"refrigerator": "fridge", "person": "human", "tv": "television", "cat": "kitten"}
+MIN_NEAREST = 6  # Minimum synonyms that are nearest to their name; 1 of 8 is chance.
 
 
 def add_sentence_encoder(
@@ -36,7 +42,7 @@ def add_sentence_encoder(
     """
 
     def fill(folder: Path) -> ModelInfo:
-        SentenceEncoder(file, tokenizer)
+        _require_synonyms(SentenceEncoder(file, tokenizer), tokenizer)
         part = TOKENIZER_JSON if tokenizer.suffix == ".json" else TOKENIZER_TEXT
         folder.mkdir()
         shutil.copyfile(file, folder / FILE)
@@ -82,3 +88,21 @@ def open_sentence_encoder(models: Models, name: str) -> SentenceEncoder:
             f"{name} is not a sentence encoder but {model.about.layout}: choose another model."
         )
     return SentenceEncoder(model.file, model.folder / parts[0])
+
+
+def _require_synonyms(encoder: SentenceEncoder, tokenizer: Path) -> None:
+    """Check that synonyms are near each other.
+
+    Raises:
+        ModelError: If they are not, for example because the tokenizer belongs to another network.
+    """
+    cosines = encoder.encode([*SYNONYMS.values()]) @ encoder.encode([*SYNONYMS]).T
+    nearest = int((cosines.argmax(axis=1) == np.arange(len(SYNONYMS))).sum())
+    is_constant = np.ptp(cosines) < 1e-3
+    if is_constant or nearest < MIN_NEAREST:
+        raise ModelError(
+            f"the network does not map English synonyms to similar vectors: {nearest} of "
+            f"{len(SYNONYMS)} words, such as sofa, are nearest to their synonym, and {MIN_NEAREST} "
+            f"are required. Check that {tokenizer} is the tokenizer of this network, and that the "
+            "network was trained to compare English texts."
+        )

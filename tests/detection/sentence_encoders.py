@@ -7,8 +7,31 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-# Vectors of words; a chair is nearest to sitting, and a piano to nothing.
-WORDS = {"chair": (1, 0.1, 0), "couch": (0.8, 0.6, 0), "sit": (1, 0, 0), "piano": (0, 0, 1)}
+# Axes: sitting, lying, music, anything unknown, and one for each other pair of synonyms.
+WORDS = {
+    name: tuple(np.eye(12)[axis])
+    for axis, pair in enumerate(
+        [
+            ("sit",),
+            ("lie",),
+            ("piano",),
+            (),
+            ("bicycle", "bike"),
+            ("airplane", "aeroplane"),
+            ("cup", "mug"),
+            ("refrigerator", "fridge"),
+            ("person", "human"),
+            ("tv", "television"),
+            ("cat", "kitten"),
+        ]
+    )
+    for name in pair
+}
+WORDS |= {
+    "chair": (1, 0.1, *[0] * 10),
+    "couch": (0.8, 0.6, *[0] * 10),
+    "sofa": (0.8, 0.61, *[0] * 10),
+}
 SPECIAL = ("[PAD]", "[UNK]", "[CLS]", "[SEP]")
 
 
@@ -23,8 +46,9 @@ class TinyEncoder:
     output: str = "last_hidden_state"
 
     def network(self, path: Path) -> Path:
-        table = np.zeros((len(SPECIAL) + len(WORDS), 3), np.float32)
+        table = np.zeros((len(SPECIAL) + len(WORDS), 12), np.float32)
         table[0] = 100  # A padding that is not masked changes the result.
+        table[1, 3] = 1
         table[len(SPECIAL) :] = tuple(WORDS.values())
         nodes = [helper.make_node("Gather", ["table", self.inputs[0]], ["hidden"])]
         if self.is_pooled:

@@ -5,7 +5,7 @@ import pytest
 
 from ldo_service.detection.vocabulary import COCO
 from ldo_service.semantics import text_search as module
-from ldo_service.semantics.text_search import search, suggest_names
+from ldo_service.semantics.text_search import MIN_COSINE, TextEncoder, search, suggest_names
 
 OBJECTS = [{"couch": 0.9, "chair": 0.1}, {"chair": 0.7}, {"whiteboard": 1.0}, {"chair": 0.7}]
 
@@ -40,7 +40,7 @@ def test_embeddings_find_words_without_synonym() -> None:
         return np.array([axes[text] for text in texts], float)
 
     assert search("Blackboard", OBJECTS) == []
-    (hit,) = search("Blackboard", OBJECTS, encode)
+    (hit,) = search("Blackboard", OBJECTS, TextEncoder(encode, MIN_COSINE))
     assert (hit.index, round(hit.score, 3)) == (2, 0.95)
     assert encoded == [("blackboard", "chair", "couch", "whiteboard")]
 
