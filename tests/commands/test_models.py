@@ -1,5 +1,6 @@
 """The command `ldo models`, and the use of registered models by other commands."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -107,6 +108,38 @@ def test_doctor_reports_missing_and_damaged_models(capsys, file: Path) -> None:
     code, out, _ = ldo(capsys, "models", "list")
     assert code == 1
     assert "damaged" in out
+
+
+@pytest.mark.parametrize(
+    ("network", "tokenizer", "complaint"),
+    [
+        ("cut", "whole", "m.onnx cannot be used .* no network in ONNX"),
+        ("whole", "cut", "is not a vocabulary of WordPiece"),
+        ("whole", "other", "[01] of 8 words, such as sofa"),
+        ("whole", "long", "inference of the network fails: .* out of data bounds"),
+        ("other", "whole", "output has the shape"),
+        ("constant", "whole", "1 of 8 words, such as sofa"),
+        ("text", "whole", "something else than numbers"),
+    ],
+)
+def test_invalid_sentence_encoder_is_refused_in_one_paragraph(
+    capsys, tmp_path: Path, network: str, tokenizer: str, complaint: str
+) -> None:
+    kinds = {"other": TinyEncoder(is_pooled=True), "constant": TinyEncoder(is_constant=True)}
+    kinds["text"] = TinyEncoder(is_text=True)
+    model = kinds.get(network, TinyEncoder()).network(tmp_path / "m.onnx")
+    if network == "cut":
+        model.write_bytes(model.read_bytes()[:200])
+    words = write_vocabulary(tmp_path / "vocab.txt")
+    special, names = words.read_text().split()[:4], words.read_text().split()[4:]
+    changed = {"cut": special[:2], "other": special + names[1:] + names[:1]}
+    changed["long"] = special + ["unused"] * 9 + names
+    words.write_text("\n".join(changed.get(tokenizer, special + names)))
+    code, _, err = ldo(capsys, "models", "add", "tiny", model, "--tokenizer", words)
+    assert code == 2
+    assert re.search(complaint, err)
+    assert_one_paragraph(err)
+    assert Models().names == []
 
 
 def test_sentence_encoder_is_added_listed_and_not_used_as_another_network(

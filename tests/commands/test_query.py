@@ -217,7 +217,9 @@ def test_registered_sentence_encoder_ranks_objects(
     answers = json.loads(out)
     assert (code, [one["id"] for one in answers]) == (0, [9, 5, 1, 4])
     assert answers[-1]["score"] == pytest.approx(0.8 * 0.8, abs=1e-6)
-    assert ldo(capsys, "query", folder, "piano")[0] == 3
+    code, _, err = ldo(capsys, "query", folder, "piano")
+    assert (code, "The nearest names, with their cosines, are" in err) == (3, True)
+    assert_one_paragraph(err)
     assert ldo(capsys, "models", "add", "other", network, "--tokenizer", words)[0] == 0
     code, _, err = ldo(capsys, "query", folder, "sit")
     assert (code, "other, tiny" in err) == (3, True)

@@ -44,23 +44,28 @@ class TinyEncoder:
     integer: int = TensorProto.INT64
     is_pooled: bool = False  # The output is [1, D], of the name `output`.
     output: str = "last_hidden_state"
+    is_text: bool = False  # The output has strings.
+    is_constant: bool = False  # All texts get the same vector.
 
     def network(self, path: Path) -> Path:
         table = np.zeros((len(SPECIAL) + len(WORDS), 12), np.float32)
         table[0] = 100  # A padding that is not masked changes the result.
         table[1, 3] = 1
         table[len(SPECIAL) :] = tuple(WORDS.values())
+        if self.is_constant:
+            table[1:] = 1
         nodes = [helper.make_node("Gather", ["table", self.inputs[0]], ["hidden"])]
         if self.is_pooled:
             nodes.append(helper.make_node("ReduceMax", ["hidden"], ["out"], axes=[1], keepdims=0))
         else:
             nodes.append(helper.make_node("Identity", ["hidden"], ["out"]))
-        nodes.append(helper.make_node("Identity", ["out"], [self.output]))
+        kind = TensorProto.STRING if self.is_text else TensorProto.FLOAT
+        nodes.append(helper.make_node("Cast", ["out"], [self.output], to=kind))
         inputs = [
             helper.make_tensor_value_info(name, self.integer, ["N", self.length])
             for name in self.inputs
         ]
-        outputs = [helper.make_tensor_value_info(self.output, TensorProto.FLOAT, None)]
+        outputs = [helper.make_tensor_value_info(self.output, kind, None)]
         values = [numpy_helper.from_array(table, "table")]
         graph = helper.make_graph(nodes, "tiny", inputs, outputs, values)
         opset = [helper.make_opsetid("", 13)]
