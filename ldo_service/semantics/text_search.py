@@ -32,7 +32,7 @@ class TextEncoder:
     """Text encoder, and the cosine from which two of its texts have a similar meaning."""
 
     encode: Encode
-    min_cosine: float | None = None  # None: `min_cosine_of` computes it for each text.
+    min_cosine: float | None = None  # `min_cosine_of` replaces None, for each text.
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ import yaml
 
 from ldo_service.detection.sentence_encoder import SentenceEncoder
 from ldo_service.detection.vocabulary import COCO
-from ldo_service.semantics.text_search import TextEncoder, min_cosine_of, search
+from ldo_service.semantics.text_search import Encode, TextEncoder, min_cosine_of, search
 from tests.detection.minilm import package_folder, write_minilm
 
 HEAD = """
@@ -38,7 +38,7 @@ class Query:
     vocabulary: np.ndarray  # Cosines to the names of COCO, [80].
 
 
-# For each rule of the table, the minimum cosine of the names that count as similar.
+# Minimum cosine of the names that count as similar, for each rule of the table.
 RULES: dict[str, Callable[[Query], float]] = {
     "cosine at least 0.35": lambda _: 0.35,
     "cosine at least 0.45": lambda _: 0.45,
@@ -53,7 +53,7 @@ RULES: dict[str, Callable[[Query], float]] = {
 }
 
 
-def queries(part: str, encode: Callable[[list[str]], np.ndarray]) -> Iterator[Query]:
+def queries(part: str, encode: Encode) -> Iterator[Query]:
     """Yield the queries of one part of the file that the vocabulary does not answer."""
     reference = encode(list(COCO))
     for room in yaml.safe_load(QUERIES.read_text("utf-8"))[part].values():
@@ -84,7 +84,7 @@ def scores(found: list[Query], rule: Callable[[Query], float]) -> str:
     )
 
 
-def check(found: list[Query], encode: Callable[[list[str]], np.ndarray]) -> None:
+def check(found: list[Query], encode: Encode) -> None:
     """Check that `search` applies the last rule of the table."""
     for query in found:
         objects = [{name: 1.0} for name in query.names]
@@ -94,7 +94,7 @@ def check(found: list[Query], encode: Callable[[list[str]], np.ndarray]) -> None
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("network", type=Path, nargs="?")
     parser.add_argument("tokenizer", type=Path, nargs="?")
     parser.add_argument("--part", choices=["choose", "judge"], action="append")
@@ -111,7 +111,7 @@ def main() -> None:
             report(part, encoder.encode, args.list)
 
 
-def report(part: str, encode: Callable[[list[str]], np.ndarray], is_list: bool) -> None:
+def report(part: str, encode: Encode, is_list: bool) -> None:
     found = list(queries(part, encode))
     check(found, encode)
     ranks = [
@@ -120,7 +120,7 @@ def report(part: str, encode: Callable[[list[str]], np.ndarray], is_list: bool) 
         if query.is_right.any()
     ]
     first, third = sum(rank < 1 for rank in ranks), sum(rank < 3 for rank in ranks)
-    print(f"\n{part}: {len(found)} queries; right name first {first}, in the first three {third} ")
+    print(f"\n{part}: {len(found)} queries; right name first {first}, in the first three {third}")
     print(HEAD)
     for name, rule in RULES.items():
         print(f"| {name} | {scores(found, rule)} |")

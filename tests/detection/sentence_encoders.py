@@ -45,7 +45,7 @@ class TinyEncoder:
     is_pooled: bool = False  # The output is [1, D], of the name `output`.
     output: str = "last_hidden_state"
     is_text: bool = False  # The output has strings.
-    is_constant: bool = False  # All texts get the same vector.
+    is_constant: bool = False  # Every text gets the same vector.
 
     def network(self, path: Path) -> Path:
         table = np.zeros((len(SPECIAL) + len(WORDS), 12), np.float32)
