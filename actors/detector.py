@@ -17,7 +17,7 @@ import numpy as np
 
 from ldo_service.conversions.objects import detections_to_message
 from ldo_service.detection.detectors import Detections, NetworkConfig
-from ldo_service.detection.model_registry import open_detector
+from ldo_service.detection.open_networks import open_detector
 from ldo_service.errors import ConfigError, ModelError
 from ldo_service.runtime import Actor, Backlog, In, Out
 from ldo_service.schemas import DetectionBoxes, Keyframe

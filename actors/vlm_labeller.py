@@ -25,7 +25,7 @@ from ldo_service.conversions.frames import crops_from_request
 from ldo_service.detection.labellers import Labeller, ScoredLabel
 from ldo_service.detection.labellers.chat_completion import HttpConfig, HttpLabeller
 from ldo_service.detection.labellers.dual_encoder import DualEncoderConfig
-from ldo_service.detection.model_registry import open_labeller
+from ldo_service.detection.open_networks import open_labeller
 from ldo_service.detection.vocabulary import canonical, read_names
 from ldo_service.errors import ConfigError, EndpointError, FrameError, ModelError
 from ldo_service.runtime import Actor, Backlog, In, Latest, Out

@@ -245,8 +245,7 @@ def networks() -> Iterator[Finding]:
         try:
             model = models.get(name)
             model.verify()
-            layout, classes = model.about.layout, len(model.about.classes)
-            yield Finding("ok", f"network {name}: {layout}, {classes} classes")
+            yield Finding("ok", f"network {name}: {model.summary}")
         except ModelError as error:
             yield Finding("bad", f"network {name}: {error}")
 

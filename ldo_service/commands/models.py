@@ -1,4 +1,4 @@
-"""Command `ldo models`: register, list and remove detectors and encoder pairs."""
+"""Command `ldo models`: register, list and remove networks."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +12,9 @@ from ldo_service import demo_networks
 from ldo_service.detection.detectors import NetworkConfig
 from ldo_service.detection.labellers.dual_encoder import DualEncoderConfig, EncoderFiles
 from ldo_service.detection.model_registry import Model, Models
+from ldo_service.detection.onnx_network import Network
+from ldo_service.detection.sentence_encoder import TOKENS
+from ldo_service.detection.sentence_models import add_sentence_encoder
 from ldo_service.detection.vocabulary import read_names
 from ldo_service.errors import ConfigError, LdoError, ModelError
 
@@ -29,11 +32,13 @@ class AddModel:
     """Check an ONNX network, copy it into the registry and register it under NAME.
 
     By default, FILE is a detector. With --text or --embeddings, FILE is the image encoder of an
-    encoder pair in the layout of CLIP. An encoder pair labels regions.
+    encoder pair in the layout of CLIP. An encoder pair labels regions. With --tokenizer, FILE is a
+    sentence encoder, with which `ldo query` compares its text with the names of objects.
 
       ldo models add nano yolox_nano.onnx --license Apache-2.0
       ldo models add clip visual.onnx --text text.onnx --vocabulary bpe_simple_vocab_16e6.txt.gz
       ldo models add clip visual.onnx --embeddings names.npz
+      ldo models add minilm model.onnx --tokenizer tokenizer.json
     """
 
     name: Name
@@ -65,6 +70,13 @@ class AddModel:
             metavar="FILE",
             help="file in .npz or .safetensors with names, their embeddings and optionally "
             "logit_scale",
+        ),
+    ] = None
+    tokenizer: Annotated[
+        Path | None,
+        argument(
+            metavar="FILE",
+            help="tokenizer.json or vocab.txt of a sentence encoder",
         ),
     ] = None
 
@@ -104,11 +116,12 @@ Verb = (
 
 
 def models(verb: Verb) -> None:
-    """Register, list and remove detectors and encoder pairs.
+    """Register, list and remove detectors, encoder pairs and sentence encoders.
 
     `detector.model` in the configuration takes the registered name of a detector.
-    `vlm_labeller.model` takes the registered name of an encoder pair, which labels regions. The
-    package contains only `demo`: a detector and a pair for the synthetic scenes.
+    `vlm_labeller.model` takes the registered name of an encoder pair, which labels regions.
+    `ldo query` uses a sentence encoder. The package contains only `demo`: a detector and a pair for
+    the synthetic scenes.
 
       ldo models add nano yolox_nano.onnx
       ldo run SOURCE --out DIR --set detector.model=nano
@@ -124,11 +137,15 @@ def models(verb: Verb) -> None:
 
 
 def add(verb: AddModel) -> None:
-    """Register a detector or an encoder pair, and print its layout and classes.
+    """Register a network, and print its layout and classes.
 
     Raises:
         ConfigError: A file cannot be used.
     """
+    if verb.tokenizer:
+        model = _add_sentence_encoder(verb, verb.tokenizer)
+        print(f"{model.name} is registered: {model.summary}, in {model.folder}.")
+        return
     model = _add_pair(verb) if verb.is_pair else _add_detector(verb)
     about = model.about
     print(
@@ -137,9 +154,36 @@ def add(verb: AddModel) -> None:
     )
 
 
+def _add_sentence_encoder(verb: AddModel, tokenizer: Path) -> Model:
+    if verb.is_pair or verb.layout or verb.names:
+        raise ConfigError(
+            "--tokenizer applies to a sentence encoder, which takes no --layout, --names, --text, "
+            "--vocabulary and --embeddings. Remove these options or --tokenizer."
+        )
+    files = verb.file.expanduser(), tokenizer.expanduser()
+    return add_sentence_encoder(Models(), verb.name, *files, _license(verb.license))
+
+
 def _add_detector(verb: AddModel) -> Model:
+    file = verb.file.expanduser()
     config = NetworkConfig(layout=verb.layout or "", names=verb.names)
-    return Models().add(verb.name, verb.file.expanduser(), config, _license(verb.license))
+    try:
+        return Models().add(verb.name, file, config, _license(verb.license))
+    except ModelError as error:
+        if _takes_tokens(file):
+            raise ConfigError(
+                f"{file} is a network for texts. Give the tokenizer.json or vocab.txt of a "
+                "sentence encoder with `--tokenizer FILE`."
+            ) from error
+        raise
+
+
+def _takes_tokens(file: Path) -> bool:
+    """Return whether a file is a network whose inputs are tokens of texts."""
+    try:
+        return any(name == TOKENS for name, *_ in Network(file).inputs)
+    except ModelError:
+        return False
 
 
 def _add_pair(verb: AddModel) -> Model:

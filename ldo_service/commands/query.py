@@ -16,14 +16,21 @@ from ldo_service.client import connect
 from ldo_service.config import actor_parameters, load_config
 from ldo_service.conversions.poses import pose_from_message
 from ldo_service.detection.labellers.dual_encoder import DualEncoderConfig
-from ldo_service.detection.model_registry import open_labeller
+from ldo_service.detection.model_registry import Models
+from ldo_service.detection.open_networks import open_labeller
+from ldo_service.detection.sentence_models import open_sentence_encoder, sentence_encoders
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Trajectory
 from ldo_service.maps.object_search import ObjectMatch, find_objects
 from ldo_service.runs.records import read_objects
 from ldo_service.schemas import MapObjects, TrackedPose
 from ldo_service.schemas.topics import POSE_TRACKED
-from ldo_service.semantics.text_search import Encode, TextComparisonError
+from ldo_service.semantics.text_search import (
+    MIN_COSINE,
+    Encode,
+    TextComparisonError,
+    TextEncoder,
+)
 from ldo_service.transport.zenoh_transport import DEFAULT_ENDPOINT
 
 from .options import EndpointAddress, Json, KeysFolder, Robot, argument
@@ -45,8 +52,9 @@ def query(
         str,
         argument(
             metavar="NAME",
-            help="encoder pair that compares TEXT with the names of the objects if none matches; "
-            "default for a run: the labeller of the run",
+            help="sentence encoder or encoder pair that compares TEXT with the names of the "
+            "objects if none matches; default: the only registered sentence encoder or, for a run, "
+            "the labeller of the run",
         ),
     ] = "",
     json_: Annotated[Json, argument(name="json")] = False,
@@ -59,12 +67,12 @@ def query(
 
       ldo query DIR "potted plant"
       ldo query live chair --json
-      ldo query live "something to sit on" --model mobileclip
+      ldo query live "something to sit on" --model minilm
     """
     is_live = where == LIVE
     found, eye = _live(robot, endpoint, keys) if is_live else _of_run(Path(where).expanduser())
-    encode = _texts_of(model, None if is_live else Path(where).expanduser())
-    answers = find_objects(text, found, eye, encode)
+    encoder = _encoder(model, None if is_live else Path(where).expanduser())
+    answers = find_objects(text, found, eye, encoder)
     if json_:
         print(json.dumps([_plain(one) for one in answers]))
     else:
@@ -97,6 +105,35 @@ def _live(robot: str, endpoint: str, keys: Path | None) -> tuple[MapObjects, np.
     return found, eye
 
 
+def _encoder(model: str, run: Path | None) -> TextEncoder:
+    """Return the text encoder of a query.
+
+    Args:
+        model: Name of a sentence encoder or of an encoder pair; empty to use the only registered
+            sentence encoder or, without one, the labeller of the run.
+        run: Folder of the run; None for a live service.
+    """
+    models = Models()
+    found = sentence_encoders(models)
+    if model not in found and (model or not found):
+        return TextEncoder(_texts_of(model, run), MIN_COSINE)
+
+    def encode(texts: Sequence[str]) -> np.ndarray:
+        if model:
+            return open_sentence_encoder(models, model).encode(texts)
+        if len(found) > 1:
+            raise TextComparisonError(
+                f"several sentence encoders are registered: {', '.join(found)}. Choose one with "
+                "`--model NAME`."
+            )
+        try:
+            return open_sentence_encoder(models, found[0]).encode(texts)
+        except ConfigError as error:
+            raise TextComparisonError(str(error)) from error
+
+    return TextEncoder(encode)
+
+
 def _texts_of(model: str, run: Path | None) -> Encode:
     """Return a function that encodes texts with an encoder pair.
 
@@ -120,7 +157,8 @@ def _texts_of(model: str, run: Path | None) -> Encode:
             what = "the query of a live service" if run is None else "the labeller of this run"
             raise TextComparisonError(
                 f"comparing the text with object names needs a text encoder, and {what} has none. "
-                "Choose a registered encoder pair with `--model NAME`."
+                "Register a sentence encoder with `ldo models add NAME FILE --tokenizer FILE`, or "
+                "choose a registered encoder pair with `--model NAME`."
             )
         try:
             return open_labeller(had.model, had.dual_encoder).texts.encode(texts)

@@ -20,7 +20,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -42,16 +42,15 @@ NAME_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 FILE, ABOUT = "model.onnx", "about.json"
 TEXT, VOCABULARY = "text.onnx", "bpe.txt.gz"
 EMBEDDINGS = ("embeddings.npz", "embeddings.safetensors", "text_embeddings.npz")
-# File names of the image encoder in a folder that is not registered, by preference.
-IMAGES = (FILE, "image_encoder.onnx")
 CLIP = "clip"  # Value of `ModelInfo.layout` for a pair of encoders.
+SENTENCE = "sentence"  # Value of `ModelInfo.layout` for a sentence encoder (`sentence_models`).
 
 
 class ModelInfo(msgspec.Struct, frozen=True, kw_only=True):
     """Description of a registered network, as stored in about.json."""
 
     sha256: str  # Checksum of model.onnx, hexadecimal.
-    layout: str  # Layout of the detector, see `yolo`, or "clip" for a pair of encoders.
+    layout: str  # Layout of the detector, see `yolo`, or "clip" or "sentence".
     classes: tuple[str, ...]  # Names of the classes, or of the labels of a labeller.
     license: str = ""  # Text of the license; empty if not stated.
     source: str = ""  # Name of the file that was copied.
@@ -65,6 +64,13 @@ class Model:
     name: str
     folder: Path
     about: ModelInfo
+
+    @property
+    def summary(self) -> str:
+        """Layout and number of classes; "sentence encoder" for a sentence encoder."""
+        if self.about.layout == SENTENCE:
+            return "sentence encoder"
+        return f"{self.about.layout}, {len(self.about.classes)} classes"
 
     @property
     def file(self) -> Path:
@@ -109,7 +115,7 @@ class Models:
             ConfigError: If the name is invalid or taken, or the folder cannot be written.
             ModelError: If the file cannot be used as a detector.
         """
-        return self._add(name, [file], lambda folder: _fill(folder, file, config, license))
+        return self.register(name, [file], lambda folder: _fill(folder, file, config, license))
 
     def add_pair(
         self,
@@ -134,11 +140,19 @@ class Models:
             ModelError: If the files cannot be used as a pair.
         """
         files = [file for file in (pair.image, pair.text, pair.vocabulary, pair.embeddings) if file]
-        return self._add(
+        return self.register(
             name, files, lambda folder: _fill_pair(folder, pair, config, names, license)
         )
 
-    def _add(self, name: str, files: Sequence[Path], fill: Callable[[Path], ModelInfo]) -> Model:
+    def register(
+        self, name: str, files: Sequence[Path], fill: Callable[[Path], ModelInfo]
+    ) -> Model:
+        """Add a model whose folder `fill` makes from `files`; a failure leaves no files behind.
+
+        Raises:
+            ConfigError: If the name is invalid or taken, or the folder cannot be written.
+            ModelError: If a file does not exist, or `fill` rejects it.
+        """
         _require_name(name)
         if (self.folder / name).exists():
             raise ConfigError(
@@ -225,90 +239,6 @@ def default_folder() -> Path:
     return Path(data) / "ldo" / "models"
 
 
-def open_detector(model: str, config: NetworkConfig) -> OnnxDetector:
-    """Open a detector by its registered name or its file.
-
-    The layout and the class names in `config` override the registered ones.
-
-    Args:
-        model: `demo`, a registered name, or the path of an ONNX file.
-        config: Settings.
-
-    Raises:
-        ConfigError: If there is no such model.
-        ModelError: If the model cannot be used as a detector.
-    """
-    if model == demo_networks.NAME:
-        return _open_demo_detector(config)
-    models = Models()
-    if model not in models.names:
-        path = Path(model).expanduser()
-        if not path.is_file():
-            raise ConfigError(
-                f"detector.model={model} is neither `demo` (included in the package) nor an "
-                f"ONNX file, nor registered in {models.folder}. Registered models: "
-                f"{', '.join(models.names) or 'none'}. `ldo models add NAME FILE` registers a "
-                "model."
-            )
-        return OnnxDetector(path, config)
-    found = models.get(model)
-    found.verify()
-    if found.about.layout == CLIP:
-        raise ModelError(
-            f"{model} is a pair of encoders: set it as vlm_labeller.model, not detector.model."
-        )
-    settings = replace(config, layout=config.layout or found.about.layout)
-    return OnnxDetector(found.file, settings, found.about.classes, name=model)
-
-
-def open_labeller(model: str, config: DualEncoderConfig, names: Sequence[str] = ()) -> DualEncoder:
-    """Open a pair of encoders by its registered name or a folder with its files.
-
-    Args:
-        model: `demo`, a registered name, or a folder with the files that the docstring of this
-            module lists.
-        config: Settings.
-        names: Labels that the labeller chooses from; empty: the labels registered with the pair, or
-            the default of `DualEncoder` for a folder.
-
-    Raises:
-        ConfigError: If there is no such model.
-        ModelError: If the model cannot be used as a labeller.
-    """
-    if model == demo_networks.NAME:
-        return _open_demo_labeller(config, names)
-    models = Models()
-    if model not in models.names:
-        folder = Path(model).expanduser()
-        if not any((folder / file).is_file() for file in IMAGES):
-            raise ConfigError(
-                f"vlm_labeller.model={model} is neither a folder with {' or '.join(IMAGES)} nor "
-                f"registered in {models.folder}. Registered models: "
-                f"{', '.join(models.names) or 'none'}. "
-                "`ldo models add NAME FILE --embeddings FILE` registers a model."
-            )
-        return DualEncoder(_pair_in(folder), config, names, name=folder.name)
-    found = models.get(model)
-    found.verify()
-    if found.about.layout != CLIP:
-        raise ModelError(
-            f"{model} is a detector ({found.about.layout}): set it as detector.model, not "
-            "vlm_labeller.model."
-        )
-    return DualEncoder(_pair_in(found.folder), config, names or found.about.classes, name=model)
-
-
-def _pair_in(folder: Path) -> EncoderFiles:
-    """Return the files of the pair in a folder, found by their usual names."""
-
-    def here(*parts: str) -> Path | None:
-        return next((folder / part for part in parts if (folder / part).is_file()), None)
-
-    return EncoderFiles(
-        here(*IMAGES) or folder / FILE, here(TEXT), here(VOCABULARY), here(*EMBEDDINGS)
-    )
-
-
 def _fill_pair(
     folder: Path, pair: EncoderFiles, config: DualEncoderConfig, names: Sequence[str], license: str
 ) -> ModelInfo:
@@ -361,22 +291,3 @@ def _require_name(name: str) -> None:
         raise ConfigError(
             f"{name!r} is reserved for the networks of the package: choose another name."
         )
-
-
-def _open_demo_detector(config: NetworkConfig) -> OnnxDetector:
-    return OnnxDetector(demo_networks.DETECTOR, config, name=demo_networks.NAME)
-
-
-def _open_demo_labeller(config: DualEncoderConfig, names: Sequence[str] = ()) -> DualEncoder:
-    """Return the built-in labeller, which has a table of text embeddings and no text encoder.
-
-    Args:
-        config: Settings. If `config.nothing` is empty, `demo_networks.NOTHING` is used.
-        names: Labels that the labeller chooses from; empty: all names of the table.
-
-    Raises:
-        ConfigError: If a name is not in the table.
-    """
-    pair = EncoderFiles(demo_networks.IMAGE_ENCODER, embeddings=demo_networks.TEXT_EMBEDDINGS)
-    settings = replace(config, nothing=config.nothing or demo_networks.NOTHING)
-    return DualEncoder(pair, settings, names, name=demo_networks.NAME)

@@ -82,6 +82,11 @@ class Network:
         return [(node.name, node.type, list(node.shape)) for node in self._session.get_inputs()]
 
     @property
+    def outputs(self) -> list[str]:
+        """Name of each output, in the order of `run`."""
+        return [node.name for node in self._session.get_outputs()]
+
+    @property
     def metadata(self) -> dict[str, str]:
         """Metadata that the exporter of the network wrote into the file.
 
@@ -102,7 +107,7 @@ class Network:
             **inputs: Value of each input, by the input's name.
 
         Raises:
-            ModelError: If the inference fails or an output has NaN or infinity.
+            ModelError: If the inference fails, or an output is not numeric or not finite.
         """
         try:
             if self.providers[0] != CPU:
@@ -116,6 +121,10 @@ class Network:
                 f"the inference of the network fails: {_first_line(error)}. Export the network "
                 "again."
             ) from error
+        if any(output.dtype.kind not in "biuf" for output in outputs):
+            raise ModelError(
+                "the network yields something else than numbers: export it without outputs of text."
+            )
         if not all(np.isfinite(output).all() for output in outputs):
             raise ModelError(
                 "the network yields NaN or infinity, so its weights are damaged: export it again."

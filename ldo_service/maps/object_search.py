@@ -6,7 +6,13 @@ import numpy as np
 
 from ldo_service.errors import DataError
 from ldo_service.schemas import MapObjects, Pose
-from ldo_service.semantics.text_search import Encode, TextComparisonError, search, suggest_names
+from ldo_service.semantics.text_search import (
+    TextComparisonError,
+    TextEncoder,
+    nearest_names,
+    search,
+    suggest_names,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,30 +31,32 @@ class ObjectMatch:
 
 
 def find_objects(
-    text: str, found: MapObjects, eye: np.ndarray | None, encode: Encode | None = None
+    text: str, found: MapObjects, eye: np.ndarray | None, encoder: TextEncoder | None = None
 ) -> list[ObjectMatch]:
     """Return the objects that match a text, the best match first.
 
     Among equally good matches, the object nearest to the camera comes first. If no name or synonym
-    matches, `encode` is used to find objects with names of similar meaning.
+    matches, `encoder` is used to find objects with names of similar meaning.
 
     Args:
         text: Text query.
         found: The objects of the map.
         eye: Camera position in the map frame, [3], meters; None if unknown.
-        encode: Text encoder; None compares names and synonyms only.
+        encoder: Text encoder; None compares names and synonyms only.
 
     Raises:
         DataError: No object matches.
     """
     names = [one.name for one in found.objects]
-    try:
-        hits, why_not = _ranked(text, found, encode), ""
-    except TextComparisonError as error:
-        hits = []
-        why_not = f" Names of similar meaning were not searched: {error}"
+    hits, note = _ranked(text, found), ""
+    if not hits and names and encoder is not None:
+        try:
+            hits = _ranked(text, found, encoder)
+            note = "" if hits else _nearest(text, names, encoder)
+        except TextComparisonError as error:
+            note = f" Names of similar meaning were not searched: {error}"
     if not hits:
-        raise DataError(_nothing(text, names) + why_not)
+        raise DataError(_nothing(text, names) + note)
     return _sorted([_match(found, index, score, eye) for index, score in hits])
 
 
@@ -65,21 +73,20 @@ def matching_objects(
     if text is None:
         hits = [(index, 1.0) for index in range(len(found.objects))]
     else:
-        hits = _ranked(text, found, None)
+        hits = _ranked(text, found)
     return _sorted([_match(found, index, score, eye) for index, score in hits])
 
 
-def _ranked(text: str, found: MapObjects, encode: Encode | None) -> list[tuple[int, float]]:
+def _ranked(
+    text: str, found: MapObjects, encoder: TextEncoder | None = None
+) -> list[tuple[int, float]]:
     """Return index and score of the objects that match a text.
 
     Raises:
         TextComparisonError: The text encoder cannot be used.
     """
     named = [dict(one.distribution) for one in found.objects]
-    hits = search(text, named)
-    if not hits and named and encode is not None:
-        hits = search(text, named, encode)
-    return [(hit.index, hit.score) for hit in hits]
+    return [(hit.index, hit.score) for hit in search(text, named, encoder)]
 
 
 def _match(found: MapObjects, index: int, score: float, eye: np.ndarray | None) -> ObjectMatch:
@@ -98,3 +105,14 @@ def _nothing(text: str, names: list[str]) -> str:
     if not names:
         return "the map has no objects yet: a detector must detect an object in three keyframes."
     return f"none of {len(names)} objects matches {text!r}. {suggest_names(text, names)}"
+
+
+def _nearest(text: str, names: list[str], encoder: TextEncoder) -> str:
+    """Return a sentence with the names nearest in meaning, because one may still be wanted.
+
+    Raises:
+        TextComparisonError: The text encoder cannot be used.
+    """
+    near = nearest_names(text, names, encoder)
+    listed = ", ".join(f"{name} ({cosine:.2f})" for name, cosine in near)
+    return f" No name is similar in meaning. The nearest names, with their cosines, are {listed}."

@@ -30,7 +30,7 @@ import numpy as np
 
 from ldo_service.datasets import open_sequence
 from ldo_service.detection.detectors import NetworkConfig
-from ldo_service.detection.model_registry import open_detector
+from ldo_service.detection.open_networks import open_detector
 from ldo_service.detection.vocabulary import Vocabulary
 from ldo_service.evaluation.label_lists import VOID, coco_list, is_void
 from ldo_service.evaluation.label_measures import Correspondences, correspondences

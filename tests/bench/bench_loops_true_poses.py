@@ -27,7 +27,7 @@ from ldo_service.conversions.objects import landmarks_from_message
 from ldo_service.conversions.poses import matrix6_to_message, pose_to_message
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.detection.detectors import NetworkConfig
-from ldo_service.detection.model_registry import open_detector
+from ldo_service.detection.open_networks import open_detector
 from ldo_service.detection.vocabulary import Vocabulary
 from ldo_service.evaluation.loops import (
     ComparedPair,

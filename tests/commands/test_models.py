@@ -1,14 +1,20 @@
 """The command `ldo models`, and the use of registered models by other commands."""
 
+import re
 from pathlib import Path
 
 import pytest
 
 from ldo_service.commands import doctor
+from ldo_service.detection.detectors import NetworkConfig
+from ldo_service.detection.labellers.dual_encoder import DualEncoderConfig
 from ldo_service.detection.model_registry import Models
+from ldo_service.detection.open_networks import open_detector, open_labeller
+from ldo_service.errors import ModelError
 from tests.commands.test_cli import assert_one_paragraph, ldo
 from tests.detection.labellers.encoders import ColorPair, vocabulary
 from tests.detection.networks import SQUARES
+from tests.detection.sentence_encoders import TinyEncoder, write_vocabulary
 
 
 @pytest.fixture(autouse=True)
@@ -102,3 +108,63 @@ def test_doctor_reports_missing_and_damaged_models(capsys, file: Path) -> None:
     code, out, _ = ldo(capsys, "models", "list")
     assert code == 1
     assert "damaged" in out
+
+
+@pytest.mark.parametrize(
+    ("network", "tokenizer", "complaint"),
+    [
+        ("cut", "whole", "m.onnx cannot be used .* no network in ONNX"),
+        ("whole", "cut", "is not a vocabulary of WordPiece"),
+        ("whole", "other", "[01] of 8 words, such as sofa"),
+        ("whole", "long", "inference of the network fails: .* out of data bounds"),
+        ("other", "whole", "output has the shape"),
+        ("constant", "whole", "1 of 8 words, such as sofa"),
+        ("text", "whole", "something else than numbers"),
+    ],
+)
+def test_invalid_sentence_encoder_is_refused_in_one_paragraph(
+    capsys, tmp_path: Path, network: str, tokenizer: str, complaint: str
+) -> None:
+    kinds = {"other": TinyEncoder(is_pooled=True), "constant": TinyEncoder(is_constant=True)}
+    kinds["text"] = TinyEncoder(is_text=True)
+    model = kinds.get(network, TinyEncoder()).network(tmp_path / "m.onnx")
+    if network == "cut":
+        model.write_bytes(model.read_bytes()[:200])
+    words = write_vocabulary(tmp_path / "vocab.txt")
+    special, names = words.read_text().split()[:4], words.read_text().split()[4:]
+    changed = {"cut": special[:2], "other": special + names[1:] + names[:1]}
+    changed["long"] = special + ["unused"] * 9 + names
+    words.write_text("\n".join(changed.get(tokenizer, special + names)))
+    code, _, err = ldo(capsys, "models", "add", "tiny", model, "--tokenizer", words)
+    assert code == 2
+    assert re.search(complaint, err)
+    assert_one_paragraph(err)
+    assert Models().names == []
+
+
+def test_sentence_encoder_is_added_listed_and_not_used_as_another_network(
+    capsys, tmp_path: Path
+) -> None:
+    network = TinyEncoder().network(tmp_path / "m.onnx")
+    add = ("models", "add", "tiny", network)
+    code, _, err = ldo(capsys, *add)
+    assert (code, "--tokenizer FILE" in err) == (2, True)
+    assert_one_paragraph(err)
+    code, _, err = ldo(capsys, *add, "--tokenizer", tmp_path / "absent.json")
+    assert (code, "absent.json is not a file" in err) == (2, True)
+    words = ("--tokenizer", write_vocabulary(tmp_path / "words.txt"))
+    code, _, err = ldo(capsys, *add, *words, "--layout", "yolox")
+    assert (code, "takes no --layout" in err) == (2, True)
+    code, out, _ = ldo(capsys, *add, *words)
+    assert (code, "tiny is registered: sentence encoder" in out) == (0, True)
+    (finding,) = doctor.networks()
+    assert finding.text == "network tiny: sentence encoder"
+    code, out, _ = ldo(capsys, "models", "list")
+    assert (code, "sentence" in out) == (0, True)
+    with pytest.raises(ModelError, match="sentence encoder"):
+        open_detector("tiny", NetworkConfig())
+    with pytest.raises(ModelError, match="sentence encoder"):
+        open_labeller("tiny", DualEncoderConfig())
+    (Models().get("tiny").folder / "vocab.txt").write_text("[CLS]\n")
+    code, out, _ = ldo(capsys, "models", "list")
+    assert (code, "damaged" in out) == (1, True)

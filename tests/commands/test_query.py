@@ -20,6 +20,7 @@ from ldo_service.runs.records import OBJECTS, read_objects, write_objects
 from ldo_service.schemas import MapObjects, Pose, encode
 from ldo_service.schemas.topics import MAP_OBJECTS
 from tests.commands.test_cli import assert_one_paragraph, ldo
+from tests.detection.sentence_encoders import TinyEncoder, write_vocabulary
 from tests.ports import free_endpoint
 from tests.schemas.examples import EXAMPLES
 
@@ -201,6 +202,31 @@ def test_unusable_model_is_a_configuration_error_only_when_needed(capsys, folder
     code, _, err = ldo(capsys, "query", folder, "throne", "--model", "absent")
     assert code == 2
     assert_one_paragraph(err)
+
+
+# --- sentence encoders ----------------------------------------------------------------------------
+def test_registered_sentence_encoder_ranks_objects(
+    capsys, monkeypatch: pytest.MonkeyPatch, folder: Path, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("LDO_MODELS", str(tmp_path / "models"))
+    network = TinyEncoder().network(tmp_path / "m.onnx")
+    words = write_vocabulary(tmp_path / "vocab.txt")
+    assert ldo(capsys, "query", folder, "sit")[0] == 3
+    assert ldo(capsys, "models", "add", "tiny", network, "--tokenizer", words)[0] == 0
+    code, out, _ = ldo(capsys, "query", folder, "sit", "--json")
+    answers = json.loads(out)
+    assert (code, [one["id"] for one in answers]) == (0, [9, 5, 1, 4])
+    assert answers[-1]["score"] == pytest.approx(0.8 * 0.8, abs=1e-6)
+    code, _, err = ldo(capsys, "query", folder, "piano")
+    assert (code, "The nearest names, with their cosines, are" in err) == (3, True)
+    assert_one_paragraph(err)
+    assert ldo(capsys, "models", "add", "other", network, "--tokenizer", words)[0] == 0
+    code, _, err = ldo(capsys, "query", folder, "sit")
+    assert (code, "other, tiny" in err) == (3, True)
+    assert_one_paragraph(err)
+    assert ldo(capsys, "query", folder, "sit", "--model", "tiny")[0] == 0
+    (tmp_path / "models" / "tiny" / "vocab.txt").write_text("damaged")
+    assert ldo(capsys, "query", folder, "sit", "--model", "tiny")[0] == 2
 
 
 # --- live -----------------------------------------------------------------------------------------

@@ -8,12 +8,8 @@ import pytest
 
 from ldo_service.detection.detectors import NetworkConfig
 from ldo_service.detection.labellers.dual_encoder import DualEncoderConfig, EncoderFiles
-from ldo_service.detection.model_registry import (
-    Models,
-    default_folder,
-    open_detector,
-    open_labeller,
-)
+from ldo_service.detection.model_registry import Models, default_folder
+from ldo_service.detection.open_networks import open_detector, open_labeller
 from ldo_service.errors import ConfigError, ModelError
 from tests.detection.labellers.encoders import ColorPair, embeddings, plain_image, vocabulary
 
