@@ -82,8 +82,8 @@ class InstancePrecision:
     """
 
     ap: float  # Mean over the thresholds 0.5, 0.55, ..., 0.9 of the IoU.
-    ap50: float  # At the threshold 0.5.
-    ap25: float  # At the threshold 0.25.
+    ap50: float  # The threshold of the IoU is 0.5.
+    ap25: float  # The threshold of the IoU is 0.25.
 
 
 @dataclass(frozen=True, eq=False, slots=True)

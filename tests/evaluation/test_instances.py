@@ -123,7 +123,10 @@ def test_precision_equals_the_reference_on_random_instances() -> None:
         kinds = {t.kind for t in true if len(t.pixels) >= MIN_PIXELS}
         assert measured.keys() == kinds
         for kind in kinds:
-            of_kind = [[one for one in some if one.kind == kind] for some in (true, found)]
+            of_kind = (
+                [one for one in true if one.kind == kind],
+                [one for one in found if one.kind == kind],
+            )
             aps = [reference_precision(*of_kind, ignored, least) for least in (*AP_IOUS, 0.25)]
             expected = np.mean(aps[:-1]), aps[0], aps[-1]
             one = measured[kind]
@@ -162,7 +165,7 @@ def test_equal_confidences_are_one_point_of_the_curve() -> None:
 
 
 def test_second_match_of_a_true_instance_is_wrong() -> None:
-    """At a threshold of 0.25, two found instances can match one true instance."""
+    """Two found instances can match one true instance at a threshold of 0.25."""
     true, halves = [span(0, 0, 10)], [span(0, 0, 5, 0.4), span(0, 5, 10, 0.8)]
     of_class = overlaps(true, halves)
     assert average_precision(of_class, 0.25, MIN_PIXELS) == 1, "the wrong one has less confidence"

@@ -212,19 +212,19 @@ def test_true_objects_have_a_high_precision_and_displaced_ones_none(
 ) -> None:
     assert errors_of(sequence, labelled).lists[COCO].instances is None, "no objects.json"
     save_true_objects(labelled, sequence)
-    found = [row.instances for row in errors_of(sequence, labelled).lists]
-    assert found[COCO]
-    assert found[ALL_NAMES]
-    assert found[COCO].keys() < found[ALL_NAMES].keys()
-    assert {"speaker", "globe"} < found[ALL_NAMES].keys()
-    mean = mean_precision(found[ALL_NAMES])
+    of_coco, of_all = (row.instances for row in errors_of(sequence, labelled).lists)
+    assert of_coco is not None
+    assert of_all is not None
+    assert of_coco.keys() < of_all.keys()
+    assert {"speaker", "globe"} < of_all.keys()
+    mean = mean_precision(of_all)
     assert mean.ap50 == 1
     assert mean.ap > 0.7
     code, out, _ = ldo(capsys, "eval", labelled, folder, "--json")
     assert code == 0
     plain = json.loads(out)["labels"][0]["lists"]["all names"]["instances"]
     assert plain["ap50"] == 1
-    assert InstancePrecision(**plain["classes"]["globe"]) == found[ALL_NAMES]["globe"]
+    assert InstancePrecision(**plain["classes"]["globe"]) == of_all["globe"]
     _, out, _ = ldo(capsys, "eval", labelled, folder)
     assert "AP50" in out
     row = next(line for line in out.splitlines() if "all names" in line and "100.0%" in line)
