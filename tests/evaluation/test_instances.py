@@ -286,7 +286,10 @@ def test_surface_behind_the_box_or_missing_belongs_to_no_object() -> None:
     labels = np.full((3, 41), 2, np.uint8)
     assert objects_at(saved("chair"), labels, 2.2 + MARGIN_M - 0.01)[20] == 0
     assert objects_at(saved("chair"), labels, 2.2 + MARGIN_M + 0.01)[20] == NO_OBJECT
-    assert objects_at(saved("chair"), labels, 0.0)[20] == NO_OBJECT
+    in_the_box = np.eye(4)
+    in_the_box[2, 3] = 2.0
+    missing = np.zeros(labels.shape, np.float32)
+    assert np.all(saved("chair").image(labels, missing, CAMERA, in_the_box, NAMES) == NO_OBJECT)
 
 
 def test_nearest_center_decides_between_boxes_in_either_order() -> None:
