@@ -36,6 +36,7 @@ class RunPlan(msgspec.Struct, frozen=True, kw_only=True):
         threads: Threads of one process; 0 for all cores.
         evaluates_all: True to evaluate the renderings of every recording in full. False to limit
             recordings without ground truth to a few rendered frames.
+        lpips: Path of the network that computes LPIPS; empty to omit LPIPS.
 
     Raises:
         ConfigError: An option is out of its range, or two options exclude each other.
@@ -48,6 +49,7 @@ class RunPlan(msgspec.Struct, frozen=True, kw_only=True):
     exports: tuple[ExportFormat, ...] = ()
     threads: int = 1
     evaluates_all: bool = False
+    lpips: str = ""
 
     def __post_init__(self) -> None:
         if self.threads < 0:
@@ -186,6 +188,8 @@ def key_of(recording: Recording, plan: RunPlan, **others: Any) -> str:
         "ldo": __version__,
         **others,
     }
+    if plan.lpips:
+        about["lpips"] = sha256(Path(plan.lpips))
     return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
 
 

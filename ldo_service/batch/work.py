@@ -19,8 +19,9 @@ import numpy as np
 from ldo_service import __version__
 from ldo_service.config import Config, actor_parameters
 from ldo_service.datasets import open_sequence
-from ldo_service.errors import LdoError
+from ldo_service.errors import ConfigError, LdoError
 from ldo_service.evaluation.finished_run import RunFrame
+from ldo_service.evaluation.lpips import Lpips
 from ldo_service.evaluation.results import Results, evaluate_run, to_json
 from ldo_service.evaluation.sheet import VIEWS
 from ldo_service.evaluation.views import EvaluatedFrames
@@ -34,7 +35,7 @@ from ldo_service.runs.networks import labelled_by, require_usable_networks
 from ldo_service.runs.offline import run_offline
 from ldo_service.runs.source import Selection
 
-from .job import BatchJob, Costs, Outcome, failed
+from .job import BatchJob, Costs, Outcome, RunPlan, failed
 from .results import EVALUATION, ResultFolder
 from .sources import SYNTHETIC
 from .staging import staging_folder
@@ -133,7 +134,7 @@ def _run(job: BatchJob, source: str, made: Path, notes: _Notes, started_s: float
     before_s = time.process_time()
     record = run_offline(_options(job, sequence, selection, made, notes, config), _ignored)
     run_s = time.process_time()
-    results = _evaluate(made, sequence, config, notes, evaluates_all=plan.evaluates_all)
+    results = _evaluate(made, sequence, config, plan, notes)
     evaluated_s = time.process_time()
     for format in plan.exports:
         target = made / EXPORTED[format][0]
@@ -181,28 +182,36 @@ def _options(
 
 
 def _evaluate(
-    made: Path, sequence: Sequence, config: Config, notes: _Notes, *, evaluates_all: bool
+    made: Path, sequence: Sequence, config: Config, plan: RunPlan, notes: _Notes
 ) -> Results | None:
     """Evaluate the run, and save its pictures.
 
     A full evaluation takes a quarter of the CPU time of a recording. If the recording has no ground
-    truth and `evaluates_all` is False, only a few frames are rendered. Such a recording gets no
-    eval.json. If the run cannot be evaluated, a note says why.
+    truth and `evaluates_all` of the plan is False, only a few frames are rendered. Such a recording
+    gets no eval.json. If the run cannot be evaluated, a note says why.
+
+    Raises:
+        ConfigError: The network of LPIPS cannot be used, or a picture cannot be written.
     """
     threads = actor_parameters(config).mapper.thread_count()
     try:
         run = read_run(made)
         run.require_source(sequence)
-        is_whole = evaluates_all or sequence.truth() is not None
+        is_whole = plan.evaluates_all or sequence.truth() is not None
         frames = None if is_whole else sample(run.frames, VIEWS)
-        results = evaluate_run(run, sequence, _ignored, threads=threads, evaluated=frames)
+        distance = Lpips(Path(plan.lpips), threads=threads) if plan.lpips else None
+        results = evaluate_run(
+            run, sequence, _ignored, distance=distance, threads=threads, evaluated=frames
+        )
+    except ConfigError:
+        raise
     except LdoError as error:
         notes.add(f"The run cannot be evaluated: {error}")
         return None
     if is_whole:
         about = {
             "pictures": [path.name for path in results.pictures],
-            "lpips": None,
+            "lpips": plan.lpips or None,
             "labelled_by": labelled_by(config),
         }
         (made / EVALUATION).write_text(json.dumps({**to_json(results), **about}, indent=1))

@@ -15,6 +15,7 @@ from ldo_service.config import Config, actor_parameters, load_config
 from ldo_service.datasets import open_sequence
 from ldo_service.errors import DataError
 from ldo_service.evaluation import loops, semantics, trajectory, views
+from ldo_service.evaluation.instances import mean_precision
 from ldo_service.evaluation.label_lists import load_classes
 from ldo_service.evaluation.label_measures import DetectionCounts
 from ldo_service.evaluation.loops import LoopErrors
@@ -77,6 +78,18 @@ def open_table(rows: list[LabelErrors], calls_per_frame: float | None) -> Table:
         agreed = f"{_number(row.consistency.share)}, {row.pairs} pairs"
         table.add_row(row.map, agreed, *_shares(row.objects, "objects"), calls)
         table.add_row("", "", *_shares(row.pixels, "pixels"), "")
+    return table
+
+
+def instance_table(rows: list[LabelErrors]) -> Table:
+    """Return a table with the average precision of the objects of each map, by list of classes."""
+    table = Table("map", "objects, by names of", "classes", "AP50", "AP", "AP25")
+    for row in rows:
+        for errors in row.lists:
+            if errors.instances is not None:
+                mean = mean_precision(errors.instances)
+                cells = (_percent(value) for value in (mean.ap50, mean.ap, mean.ap25))
+                table.add_row(row.map, errors.labels.name, str(len(errors.instances)), *cells)
     return table
 
 
@@ -226,6 +239,8 @@ def _print_labels(console: Console, results: Results, who: dict[str, str]) -> No
     console.print(f"Labels by {', '.join(named)}.", style="dim", soft_wrap=True)
     console.print(label_table(results.labels))
     console.print(open_table(results.labels, results.vlm_calls_per_frame))
+    if results.labels[-1].lists[0].instances is not None:
+        console.print(instance_table(results.labels))
 
 
 def trajectory_table(rows: dict[str, TrajectoryErrors]) -> Table:

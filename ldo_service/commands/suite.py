@@ -8,6 +8,7 @@ import tyro
 from rich.console import Console
 
 from ldo_service.errors import ConfigError, DataError
+from ldo_service.evaluation.lpips import Lpips
 from ldo_service.suites import SuiteRun, SuiteRunner, load_suite, markdown
 
 from .options import Overwrite, Settings, argument
@@ -34,6 +35,13 @@ def suite(
             "the load",
         ),
     ] = 1,
+    lpips: Annotated[
+        Path | None,
+        argument(
+            metavar="FILE.onnx",
+            help="network of LPIPS, as for `ldo eval`; without it, the tables have no LPIPS",
+        ),
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Run and evaluate several sequences and variants, and print tables of their metrics.
@@ -52,7 +60,10 @@ def suite(
     if workers < 1:
         raise ConfigError(f"--workers {workers} must be at least 1.")
     chosen = load_suite(name)
-    work = SuiteRunner(chosen, data.expanduser(), out.expanduser(), set, overwrite, workers)
+    if lpips is not None:
+        Lpips(lpips)  # A wrong file is refused before the first run.
+    folders = data.expanduser(), out.expanduser()
+    work = SuiteRunner(chosen, *folders, set, overwrite, workers, lpips)
     _require_folder(work.out)
     console, total = Console(stderr=True), len(work.entries())
     done: list[SuiteRun] = []
@@ -66,7 +77,7 @@ def suite(
         raise DataError(
             f"{work.data} has none of the sequences of {name}. Give their folder with --data."
         )
-    table = markdown(chosen, outcomes)
+    table = markdown(chosen, outcomes, has_lpips=lpips is not None)
     try:
         (work.out / TABLE).write_text(table)
     except OSError as error:

@@ -14,6 +14,7 @@ from ldo_service.geometry import Trajectory
 from ldo_service.geometry.sequence import Sequence
 from ldo_service.semantics.semantics_file import SavedSemantics
 
+from .instances import SavedObjects
 from .loops import FoundLoops
 
 # Stamps that differ less are equal: float64 seconds cannot represent the nanoseconds of the files.
@@ -97,6 +98,7 @@ class PosedMap:
         semantics: Labels of the Gaussians; None without a detector.
         corrections: Corrections of vignetting, depth bias and rolling shutter of the camera, as
             applied to the keyframes.
+        objects: Objects of the map; None without a detector.
     """
 
     name: str
@@ -105,6 +107,7 @@ class PosedMap:
     exposures: Exposures
     semantics: SavedSemantics | None = None
     corrections: CorrectionHistory = field(default_factory=CorrectionHistory)
+    objects: SavedObjects | None = None
 
     def T_map_camera(self, frame: RunFrame) -> np.ndarray:
         """Return the pose of a frame, the transform from the camera to the map, [4, 4].

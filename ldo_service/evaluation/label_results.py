@@ -12,6 +12,7 @@ from ldo_service.detection.vocabulary import COCO
 from ldo_service.geometry.sequence import Sequence
 
 from .finished_run import FinishedRun
+from .instances import InstancePrecision, mean_precision
 from .label_lists import UNKNOWN, VOID, LabelSet, full_list
 from .label_measures import DetectionCounts, class_ious
 from .pictures import Color, contact_sheet, legend
@@ -232,7 +233,19 @@ def _plain_list(row: ListErrors) -> dict[str, Any]:
             for k, name in enumerate(row.labels.names)
             if true[k]
         },
+        "instances": None if row.instances is None else _plain_instances(row.instances),
     }
+
+
+def _plain_instances(by_class: dict[str, InstancePrecision]) -> dict[str, Any]:
+    return {
+        **_plain_precision(mean_precision(by_class)),
+        "classes": {name: _plain_precision(one) for name, one in by_class.items()},
+    }
+
+
+def _plain_precision(one: InstancePrecision) -> dict[str, float | None]:
+    return {name: finite(getattr(one, name)) for name in ("ap", "ap50", "ap25")}
 
 
 def _plain_figures(row: ListErrors, gate: float) -> dict[str, Any]:

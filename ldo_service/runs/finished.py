@@ -15,15 +15,17 @@ from typing import Any
 import numpy as np
 
 from ldo_service.calibration.correction import read_corrections
+from ldo_service.conversions.poses import pose_from_message
 from ldo_service.errors import DataError
 from ldo_service.evaluation.finished_run import Exposures, FinishedRun, PosedMap, RunFrame
+from ldo_service.evaluation.instances import SavedObjects
 from ldo_service.gaussians.file_formats import read_ply
 from ldo_service.geometry import Camera, Trajectory
 from ldo_service.semantics.semantics_file import SavedSemantics, read_semantics
 from ldo_service.volumes import Viewpoint
 
 from .folder import CAMERA, REFINED, SEMANTICS
-from .records import read_loops
+from .records import OBJECTS, read_loops, read_objects
 
 
 def read_run(folder: Path, *, has_map: bool = True) -> FinishedRun:
@@ -115,6 +117,18 @@ class MapFolder:
         path = self.folder / SEMANTICS
         return read_semantics(path, gaussians) if path.is_file() else None
 
+    def objects(self) -> SavedObjects | None:
+        """Return the objects of the map, or None if the run had no detector and no labeller."""
+        if not (self.folder / OBJECTS).is_file():
+            return None
+        objects = read_objects(self.folder).objects
+        return SavedObjects(
+            tuple(one.name for one in objects),
+            np.array([one.confidence for one in objects], float),
+            np.reshape([pose_from_message(one.T_map_object) for one in objects], (-1, 4, 4)),
+            np.reshape([one.size for one in objects], (-1, 3)),
+        )
+
     def trajectory(self) -> Trajectory:
         """Return T_map_camera of every frame with a pose, after the last correction."""
         return Trajectory.load(require_file(self.folder, "trajectory.txt"))
@@ -137,15 +151,15 @@ class MapFolder:
             return {int(k["keyframe"]): int(k["frame_index"]) for k in keyframes}
 
     def posed(self, name: str) -> PosedMap:
-        """Return the map with its trajectory, exposures and labels.
+        """Return the map with its trajectory, exposures, labels and objects.
 
         Args:
             name: Name of the map in the evaluation, "online" or "refined".
         """
         rows = self.gaussians()
         labels = self._semantics(len(rows))
-        corrections = read_corrections(self.folder)
-        return PosedMap(name, rows, self.trajectory(), self.exposures(), labels, corrections)
+        about = labels, read_corrections(self.folder), self.objects()
+        return PosedMap(name, rows, self.trajectory(), self.exposures(), *about)
 
 
 def read_viewpoints(folder: Path) -> dict[int, Viewpoint]:

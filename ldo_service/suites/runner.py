@@ -53,6 +53,7 @@ class SuiteRunner:
         overwrite: True to repeat finished runs too.
         workers: Number of runs at the same time. A single worker uses all cores; several workers
             use one core each.
+        lpips: Network that computes LPIPS; None to omit LPIPS.
     """
 
     suite: Suite
@@ -61,6 +62,7 @@ class SuiteRunner:
     settings: tuple[str, ...] = ()
     overwrite: bool = False
     workers: int = 1
+    lpips: Path | None = None
 
     def entries(self) -> list[SuiteRun]:
         """Return all runs of the suite."""
@@ -137,6 +139,7 @@ class SuiteRunner:
             refine=suite.refine,
             threads=0 if self.workers == 1 else 1,
             evaluates_all=True,
+            lpips=str(self.lpips.absolute()) if self.lpips else "",
         )
 
     def _outcome(self, entry: SuiteRun, source: Recording | str, failure: str) -> Outcome:

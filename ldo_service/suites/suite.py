@@ -20,6 +20,7 @@ HERE = Path(__file__).parent
 SYNTHETIC = "synthetic:"
 # Metrics that depend on the front end: tracker and detector.
 OF_FRONT_END = frozenset({"fps", "tracking_s", "ate_online_cm"})
+OF_LPIPS = frozenset({"lpips", "lpips_training"})  # Metrics that need a network of LPIPS.
 NAME = re.compile(r"[\w][\w .+-]{0,60}")  # Valid names of folders.
 
 
@@ -66,6 +67,10 @@ class EvaluatedRun:
         """True if a detector or a labeller ran, or if the results do not state it."""
         who = self.results.get("labelled_by")
         return who is None or any(who.values())
+
+    def ap50(self) -> float:
+        """Return the AP50 of the objects of the newest map, 0..1, over the COCO classes."""
+        return self.results["labels"][-1]["lists"]["COCO"]["instances"]["ap50"]
 
     def consistency(self) -> float | None:
         """Return the fraction of object pixels with equal labels in two views of the newest map.
@@ -128,10 +133,15 @@ FIGURES: dict[str, Score] = {
     "ssim_training": Score(
         "SSIM, training views", ".3f", lambda run: run.rendering(TRAINING, "ssim")
     ),
+    "lpips": Score("LPIPS", ".3f", lambda run: run.rendering(HELD_OUT, "lpips")),
+    "lpips_training": Score(
+        "LPIPS, training views", ".3f", lambda run: run.rendering(TRAINING, "lpips")
+    ),
     "depth_l1_cm": Score("depth L1 cm", ".2f", _depth_l1_cm),
     "miou": Score("mIoU %", ".1f", lambda run: 100 * run.labels()["mean_iou"]),
     "object_iou": Score("object mIoU %", ".1f", lambda run: 100 * run.labels()["object_iou"]),
     "consistency": Score("consistency", ".3f", lambda run: run.consistency()),
+    "ap50": Score("AP50 %", ".1f", lambda run: 100 * run.ap50()),
     "loop_precision": Score("precision", ".3f", lambda run: run.results["loops"]["precision"]),
     "loop_recall": Score("recall", ".3f", lambda run: run.results["loops"]["recall"]),
     "fps": Score("FPS", ".2f", lambda run: run.summary["fps"]),

@@ -3,22 +3,34 @@
 from collections.abc import Sequence
 from statistics import mean, stdev
 
+import msgspec
+
 from .runner import Outcome
-from .suite import FIGURES, Score, Suite
+from .suite import FIGURES, OF_LPIPS, Score, Suite
 
 AVERAGE = "average"
 Cells = dict[str, str]  # Texts by column.
+NO_LPIPS = "LPIPS is not computed; `--lpips FILE.onnx` adds it."
 
 
-def markdown(suite: Suite, outcomes: Sequence[Outcome]) -> str:
+def markdown(suite: Suite, outcomes: Sequence[Outcome], *, has_lpips: bool = False) -> str:
     """Return the outcomes of a suite as tables in Markdown.
 
     If the suite has one sequence, one table shows all metrics. Otherwise there is one table for
     each metric, with a column for each sequence. A cell has the mean over the seeds, and with
     several seeds the standard deviation. The first rows are published values. A line under each
     table names the variants whose runs had neither a detector nor a labeller.
+
+    Args:
+        suite: The suite.
+        outcomes: Outcomes of all its runs.
+        has_lpips: False to leave out LPIPS, because no network computed it.
     """
     parts, note = [f"# {suite.title}", suite.about.strip()], _unlabelled(suite, outcomes)
+    if not has_lpips and OF_LPIPS.intersection(suite.figures):
+        parts.append(NO_LPIPS)
+        others = tuple(name for name in suite.figures if name not in OF_LPIPS)
+        suite = msgspec.structs.replace(suite, figures=others)
     if len(suite.sequences) == 1:
         parts += [_of_one_sequence(suite, outcomes), note]
     else:

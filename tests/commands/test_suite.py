@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 
 from tests.commands.test_cli import ldo
+from tests.evaluation.onnx_file import write_network
+from tests.evaluation.test_lpips import IMAGES, distance_nodes
 
 SUITE = {
     "title": "Rooms",
@@ -62,6 +64,45 @@ def test_later_variants_can_reuse_the_front_end_of_the_first(capsys, tmp_path: P
     stages = json.loads((second_run / "summary.json").read_text())["stage_ms"]
     assert "tracker" not in stages
     assert "mapper" in stages
+
+
+def test_lpips_of_a_network_has_a_column(capsys, tmp_path: Path) -> None:
+    network = write_network(tmp_path / "net.onnx", distance_nodes(), IMAGES)
+    path = tmp_path / "rooms.yaml"
+    one = {"sequences": {"room": "synthetic:room"}, "figures": ["lpips_training"]}
+    path.write_text(json.dumps(SUITE | one))
+    arguments = "suite", path, "--out", tmp_path / "out", "--lpips", network
+    code, out, _ = ldo(capsys, *arguments)
+    assert code == 0
+    assert "| room | LPIPS, training views |" in out
+    run = tmp_path / "out" / "room" / "plain@0"
+    found = json.loads((run / "eval.json").read_text())
+    assert found["lpips"] == str(network)
+    (training,) = (row for row in found["rendering"] if row["protocol"] == "B training")
+    assert training["mean"]["lpips"] > 0
+    assert f"| plain | {training['mean']['lpips']:.3f} |" in out
+    assert ldo(capsys, *arguments)[1] == out, "a finished run is kept"
+
+
+def test_wrong_network_of_lpips_is_refused_before_any_run(capsys, suite: Path) -> None:
+    out = suite.parent / "out"
+    code, _, err = ldo(capsys, "suite", suite, "--out", out, "--lpips", suite)
+    assert code == 2
+    assert f"--lpips {suite} cannot be opened" in err
+    assert not out.exists()
+
+
+def test_network_that_fails_on_the_images_fails_the_run(capsys, caplog, tmp_path: Path) -> None:
+    network = write_network(
+        tmp_path / "net.onnx", distance_nodes(), dict.fromkeys(IMAGES, (1, 3, 64, 64))
+    )
+    path = tmp_path / "rooms.yaml"
+    one = {"sequences": {"room": "synthetic:room"}, "figures": ["lpips_training"]}
+    path.write_text(json.dumps(SUITE | one))
+    code, out, _ = ldo(capsys, "suite", path, "--out", tmp_path / "out", "--lpips", network)
+    assert code == 1
+    assert "| plain | failed |" in out
+    assert "dynamic height and width" in caplog.text
 
 
 def test_missing_suite_is_named_in_the_error(capsys, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.detection.vocabulary import Vocabulary, coco_class
 from ldo_service.errors import DataError
 from ldo_service.evaluation.finished_run import FinishedRun, RunFrame
+from ldo_service.evaluation.instances import InstancePrecision, mean_precision
 from ldo_service.evaluation.label_measures import DetectionCounts
 from ldo_service.evaluation.label_results import frames_to_show, plain_labels
 from ldo_service.evaluation.results import NO_LABELS, NO_TRUTH
@@ -24,6 +25,8 @@ from ldo_service.geometry.sequence import FrameLabels
 from ldo_service.runs.finished import read_run
 from ldo_service.runs.folder import SEMANTICS
 from ldo_service.runs.offline import run_offline
+from ldo_service.runs.records import write_objects
+from ldo_service.schemas import MapObject, MapObjects, Pose
 from ldo_service.semantics.gaussian_labels import fields
 from ldo_service.semantics.semantics_file import write_semantics
 from tests.commands.test_cli import ldo
@@ -123,6 +126,49 @@ def on_surfaces(
     return i, truth.frame(frame.index).class_ids[v[i], u[i]]
 
 
+def save_true_objects(folder: Path, sequence: Sequence, offset_m: float = 0.0) -> None:
+    """Save an object for each true instance, with the box of its surface, moved along x."""
+    run, truth = read_run(folder), sequence.true_labels()
+    assert truth is not None
+    points: dict[tuple[int, str], list[np.ndarray]] = {}
+    for frame in run.frames:
+        labels, shown = truth.frame(frame.index), sequence[frame.index]
+        p_camera = shown.camera.backproject(shown.depth_m)
+        p_map = se3.transform(run.maps[0].T_map_camera(frame), p_camera.reshape(-1, 3))
+        for instance in np.unique(labels.instance_ids).tolist():
+            mask = (labels.instance_ids == instance).ravel() & (shown.depth_m > 0).ravel()
+            name = truth.class_names[labels.class_ids.ravel()[mask][0]]
+            if is_object(name):
+                points.setdefault((instance, coco_class(name) or name), []).append(p_map[mask])
+    objects = (
+        map_object(number, name, np.concatenate(of_views) + np.array([offset_m, 0, 0]))
+        for number, ((_, name), of_views) in enumerate(sorted(points.items()))
+    )
+    found = MapObjects(stamp_ns=0, version=1, graph_version=1, objects=tuple(objects))
+    write_objects(folder, found)
+
+
+def map_object(number: int, name: str, p_map: np.ndarray) -> MapObject:
+    low, high = p_map.min(axis=0), p_map.max(axis=0)
+    x, y, z = ((low + high) / 2).tolist()
+    width, height, depth = (high - low).tolist()
+    return MapObject(
+        id=number,
+        name=name,
+        confidence=0.9,
+        centroid=(x, y, z),
+        covariance=tuple(np.eye(3).ravel().tolist()),
+        T_map_object=Pose(translation=(x, y, z), quaternion=(1.0, 0.0, 0.0, 0.0)),
+        size=(width, height, depth),
+        distribution=((name, 0.9),),
+        entropy=0.5,
+        observation_count=3,
+        miss_count=0,
+        first_keyframe=0,
+        last_keyframe=2,
+    )
+
+
 def is_object(name: str) -> bool:
     return name not in ("", "undefined", "wall", "floor", "ceiling")
 
@@ -159,6 +205,35 @@ def test_map_with_true_labels_scores_high(sequence: Sequence, labelled: Path) ->
     assert errors.objects == DetectionCounts(right=2, wanted=2, named=2), "speaker and globe"
     assert errors.pixels.recall > 0.9
     assert errors.pixels.precision > 0.9
+
+
+def test_true_objects_have_a_high_precision_and_displaced_ones_none(
+    capsys, sequence: Sequence, labelled: Path, folder: Path
+) -> None:
+    assert errors_of(sequence, labelled).lists[COCO].instances is None, "no objects.json"
+    save_true_objects(labelled, sequence)
+    of_coco, of_all = (row.instances for row in errors_of(sequence, labelled).lists)
+    assert of_coco is not None
+    assert of_all is not None
+    assert of_coco.keys() < of_all.keys()
+    assert {"speaker", "globe"} < of_all.keys()
+    mean = mean_precision(of_all)
+    assert mean.ap50 == 1
+    assert mean.ap > 0.7
+    code, out, _ = ldo(capsys, "eval", labelled, folder, "--json")
+    assert code == 0
+    plain = json.loads(out)["labels"][0]["lists"]["all names"]["instances"]
+    assert plain["ap50"] == 1
+    assert InstancePrecision(**plain["classes"]["globe"]) == of_all["globe"]
+    _, out, _ = ldo(capsys, "eval", labelled, folder)
+    assert "AP50" in out
+    row = next(line for line in out.splitlines() if "all names" in line and "100.0%" in line)
+    assert f"{mean.ap:.1%}" in row
+    save_true_objects(labelled, sequence, offset_m=3.0)
+    displaced = errors_of(sequence, labelled).lists[ALL_NAMES]
+    assert displaced.instances
+    assert mean_precision(displaced.instances).ap25 == 0
+    assert displaced.figures(0).mean_iou > 0.7, "the labels of the pixels are still right"
 
 
 def test_wrong_names_lower_the_scores_but_not_consistency(

@@ -21,7 +21,7 @@ from ldo_service.suites import (
     load_suite,
     markdown,
 )
-from ldo_service.suites.suite import FIGURES
+from ldo_service.suites.suite import FIGURES, HELD_OUT, TRAINING
 
 SETTING = "mapper.iterations=2"
 TWO = Suite(
@@ -87,6 +87,12 @@ def test_keys_differ_where_the_results_do(tmp_path: Path) -> None:
     assert set(keys(shared)).isdisjoint(own)
     assert keys(TWO, workers=2) == own
     assert set(keys(TWO, settings=("mapper.seed=5",))).isdisjoint(own)
+    first, copy, other = (tmp_path / name for name in ("first", "copy", "other"))
+    for path, content in ((first, "network"), (copy, "network"), (other, "another network")):
+        path.write_text(content)
+    with_lpips = keys(TWO, lpips=first)
+    assert set(with_lpips).isdisjoint([*own, *keys(TWO, lpips=other)])
+    assert keys(TWO, lpips=copy) == with_lpips, "the content of the network decides"
 
 
 def test_invalid_setting_of_a_variant_is_refused_before_any_run(tmp_path: Path) -> None:
@@ -153,6 +159,44 @@ def test_table_names_the_variants_that_ran_without_a_detector() -> None:
 
     assert table({"detector": "", "labeller": ""}).count(f"|\n\n{line}\n") == len(TWO.figures)
     assert "without a detector" not in table({"detector": "", "labeller": "demo"})
+
+
+@pytest.mark.parametrize("sequences", [1, 2])
+def test_lpips_has_no_column_without_its_network(sequences: int) -> None:
+    line = "LPIPS is not computed; `--lpips FILE.onnx` adds it."
+    names = ("ate_cm", "lpips", "lpips_training")
+    suite = msgspec.structs.replace(
+        TWO, sequences=dict(list(TWO.sequences.items())[:sequences]), figures=names
+    )
+    rows = [{"protocol": p, "mean": {"lpips": v}} for p, v in ((HELD_OUT, 0.2), (TRAINING, 0.125))]
+    found = replace(scores(0.01), results={"trajectory": None, "rendering": rows})
+    outcomes = [Outcome(entry, found) for entry in suite.entries(Path("/data"))]
+    without, table = (markdown(suite, outcomes, has_lpips=known) for known in (False, True))
+    assert without.count(line) == 1
+    assert without.count("LPIPS") == 1, "no column and no table"
+    assert "0.125" not in without
+    assert line not in table
+    assert "LPIPS, training views |" in table
+    assert "0.125" in table
+    assert "0.200" in table
+    assert line not in markdown(TWO, [Outcome(e, found) for e in TWO.entries(Path())])
+
+
+def test_semantic_scores_are_those_of_the_newest_map() -> None:
+    def labels(value: float) -> dict[str, Any]:
+        coco = {"from 0.2 %": {"mean_iou": value}, "instances": {"ap50": value / 2}}
+        return {"consistency": value, "lists": {"COCO": coco}}
+
+    found = EvaluatedRun({}, {"labels": [labels(0.25), labels(0.5)]})
+    named = {name: FIGURES[name].of(found) for name in ("miou", "consistency", "ap50")}
+    assert named == {"miou": 50, "consistency": 0.5, "ap50": 25}
+
+
+@pytest.mark.parametrize("name", sorted(set(known_suites()) - {"loops"}))
+def test_suites_have_all_semantic_columns_or_none(name: str) -> None:
+    figures = set(load_suite(name).figures)
+    assert {"miou", "consistency", "ap50"} & figures in ({"miou", "consistency", "ap50"}, set())
+    assert ("psnr_db" in figures) == ("lpips" in figures)
 
 
 @pytest.mark.parametrize("name", sorted(FIGURES))
