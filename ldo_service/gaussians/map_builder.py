@@ -97,7 +97,8 @@ class MapBuilder:
                 Most iterations run at half resolution.
             dynamic_mask: Pixels of moving objects, which are not mapped, [H, W] bool; None if none.
         """
-        self._load_visible(PlacedCamera(frame.camera, T_map_camera, MaxDepthGrid.of(frame.depth_m)))
+        horizon = MaxDepthGrid.of(frame.depth_m)
+        self._load_visible(PlacedCamera(frame.camera, T_map_camera, horizon))
         self._renderer.forget()
         before = self.render_from(frame.camera, T_map_camera)
         counts = None if dynamic_mask is None else (~dynamic_mask).astype(np.uint8)
@@ -106,7 +107,7 @@ class MapBuilder:
         self._insert(frame, T_map_camera, keyframe, before, view.exposure, dynamic_mask)
         self._published.add(keyframe, T_map_camera)
         self._newest = keyframe
-        for forgotten in self.views.add(view):
+        for forgotten in self.views.add(view, horizon):
             self._published.forget(forgotten)
             self.fitting.forget_view(forgotten)
         check = self._confirmation.start(keyframe, len(self.gaussians))
