@@ -112,7 +112,7 @@ class MapBuilder:
             self.fitting.forget_view(forgotten)
         check = self._confirmation.start(keyframe, len(self.gaussians))
         plan = self.fitting.plan(view, MAX_ITERATIONS_PER_EFFORT * iterations, check.keyframes)
-        touched = self._fit(plan, effort=iterations, starts_half=True, observe=check.observe)
+        touched = self._fit(plan, effort=iterations, after_keyframe=True, observe=check.observe)
         mask = check.hidden_mask(self.gaussians.anchors)
         if len(self.views) % self.config.prune_keyframes == 0:
             mask |= self._misshapen_mask(touched)
@@ -228,10 +228,10 @@ class MapBuilder:
         plan: Iterable[int],
         rates: tuple[float, float] = (1.0, 1.0),
         effort: float = inf,
-        starts_half: bool = False,
+        after_keyframe: bool = False,
         observe: Observer | None = None,
     ) -> np.ndarray:
-        touched = self.fitting.fit(self.gaussians, plan, rates, effort, starts_half, observe)
+        touched = self.fitting.fit(self.gaussians, plan, rates, effort, after_keyframe, observe)
         self._log.changed(touched)
         return touched
 

@@ -12,7 +12,7 @@ from ldo_service.errors import ConfigError, DeviceError, named
 from ldo_service.geometry import Camera, se3
 from ldo_service.kernels.gpu.device import Device
 
-from .adam import AdamConfig
+from .adam import AdamConfig, residual_factor
 from .device_choice import choose_backend, given
 from .exposure import Exposure
 from .loss import ImageLoss, LossWeights
@@ -168,7 +168,7 @@ class GaussianOptimizer:
         rates: tuple[float, float] = (1.0, 1.0),
         fixed: int | None = None,
         effort: float = inf,
-        starts_half: bool = False,
+        after_keyframe: bool = False,
         observe: Observer | None = None,
         is_usable: Callable[[int], bool] = lambda _: True,
     ) -> list[ImageLoss]:
@@ -190,7 +190,9 @@ class GaussianOptimizer:
                 Gaussians, an iteration takes (1 + r) / 2 units. At half resolution, this number of
                 units is multiplied by HALF_EFFORT.
                 No iteration starts once the sum has reached `effort`.
-            starts_half: Start at half resolution, for the fraction `half_share` of `effort`.
+            after_keyframe: The plan follows a new keyframe. The learning rates then change with the
+                color error of each image; see `residual_factor`. The iterations start at half
+                resolution, for the fraction `half_share` of `effort`.
             observe: Function that is called after each iteration with the keyframe and the visible
                 Gaussians; None for none.
             is_usable: Function that returns whether the map may be fitted to a keyframe now. It is
@@ -200,7 +202,7 @@ class GaussianOptimizer:
         Returns:
             Loss before each step, for the iterations that were run.
         """
-        options = rates, fixed, effort, starts_half
+        options = rates, fixed, effort, after_keyframe
         if self._backend.can_fail:
             attempt, poses = PlanAttempt(views, observe), self._poses.snapshot()
             try:
@@ -279,12 +281,12 @@ class GaussianOptimizer:
         rates: tuple[float, float],
         fixed: int | None,
         effort: float,
-        starts_half: bool,
+        after_keyframe: bool,
         observe: Observer | None,
         is_usable: Callable[[int], bool],
     ) -> list[ImageLoss]:
         losses, spent = [], 0.0
-        half_effort = self.config.half_share * effort if starts_half else 0.0
+        half_effort = self.config.half_share * effort if after_keyframe else 0.0
         for rate, keyframe in zip(np.geomspace(*rates, len(plan)), plan, strict=True):
             if spent >= effort:
                 break
@@ -293,7 +295,7 @@ class GaussianOptimizer:
             view = views[keyframe]
             side_px = min(view.camera.width, view.camera.height)
             is_half = spent < half_effort and side_px >= MIN_HALVED_PX
-            step = self._step(view, rate, keyframe == fixed, is_half)
+            step = self._step(view, rate, keyframe == fixed, is_half, after_keyframe)
             if step.view is not view:
                 views[keyframe] = step.view
             if observe is not None:
@@ -325,15 +327,18 @@ class GaussianOptimizer:
             DeviceError: The device failed. The map and the moments of its Gaussians are unchanged.
         """
         with self._begun(gaussians):
-            return self._step(view, rate, is_fixed, is_half)
+            return self._step(view, rate, is_fixed, is_half, False)
 
     def _step(
-        self, view: TrainingView, rate: float, is_fixed: bool, is_half: bool
+        self, view: TrainingView, rate: float, is_fixed: bool, is_half: bool, follows_error: bool
     ) -> IterationResult:
         self._backend.render(view, is_half=is_half)
         if not is_fixed:
             view = self._exposed(view)
-        loss, visible = self._backend.descend(view.exposure, rate=rate)
+        loss, visible = self._backend.descend(
+            view.exposure,
+            rate=lambda loss: rate * (residual_factor(loss.l1) if follows_error else 1.0),
+        )
         if not is_fixed:
             view = self._placed(view, visible.xi, rate)
         return IterationResult(loss, view, visible)
