@@ -56,7 +56,7 @@ class GaussianOptimizerConfig:
 
     # Fraction of the computing time after a new keyframe that is spent on iterations at half
     # resolution, before those at full resolution. Iterations at half resolution improve the map
-    # almost as much.
+    # almost as much. All iterations are at half resolution if the rest of the effort is below 1.
     half_share: float = 0.8
     # Number of visible Gaussians at which an iteration is assumed to spend half of its time on the
     # pixels and half on the Gaussians. The effort of an iteration is computed from it.
@@ -192,7 +192,8 @@ class GaussianOptimizer:
                 No iteration starts once the sum has reached `effort`.
             after_keyframe: The plan follows a new keyframe. The learning rates then change with the
                 color error of each image; see `residual_factor`. The iterations start at half
-                resolution, for the fraction `half_share` of `effort`.
+                resolution, for the fraction `half_share` of `effort`, or for all of it if less than
+                1 unit would remain.
             observe: Function that is called after each iteration with the keyframe and the visible
                 Gaussians; None for none.
             is_usable: Function that returns whether the map may be fitted to a keyframe now. It is
@@ -286,7 +287,7 @@ class GaussianOptimizer:
         is_usable: Callable[[int], bool],
     ) -> list[ImageLoss]:
         losses, spent = [], 0.0
-        half_effort = self.config.half_share * effort if after_keyframe else 0.0
+        half_effort = self._half_effort(effort) if after_keyframe else 0.0
         for rate, keyframe in zip(np.geomspace(*rates, len(plan)), plan, strict=True):
             if spent >= effort:
                 break
@@ -304,6 +305,14 @@ class GaussianOptimizer:
             full = (1 + len(step.visible.indices) / self.config.usual_reach) / 2
             spent += HALF_EFFORT * full if is_half else full
         return losses
+
+    def _half_effort(self, effort: float) -> float:
+        """Return the part of a limited `effort` that is spent on iterations at half resolution.
+
+        All of it is, if the rest is too small for a whole iteration at full resolution.
+        """
+        share = self.config.half_share
+        return effort if (1 - share) * effort < 1 else share * effort
 
     def step(
         self,

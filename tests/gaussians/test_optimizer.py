@@ -263,6 +263,19 @@ def test_iterations_at_half_resolution_change_pose_and_exposure(
     assert (views[2].exposure.matrix != start[1][2].exposure.matrix).any()
 
 
+def test_effort_below_a_full_iteration_is_spent_at_half_resolution(start: tuple) -> None:
+    """Half of an effort of 1.9 leaves 0.95 units for full resolution, half of 2.1 leaves 1.05."""
+    rows = {
+        (effort, share): in_half_resolution(
+            start, alternating(30), effort=effort, half_share=share
+        )[0].rows
+        for effort in (1.9, 2.1)
+        for share in (0.5, 1.0)
+    }
+    np.testing.assert_array_equal(rows[1.9, 0.5], rows[1.9, 1.0])
+    assert not np.array_equal(rows[2.1, 0.5], rows[2.1, 1.0])
+
+
 def test_size_limit_counts_full_pixels(start: tuple) -> None:
     config = GaussianOptimizerConfig(max_sigma_px=1.5)
     sigmas_m = []
