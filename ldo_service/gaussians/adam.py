@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import inf
+from math import inf, sqrt
 from weakref import ref
 
 import numpy as np
@@ -13,6 +13,13 @@ from ldo_service.kernels import _adam
 from .model import GaussianMap
 from .renderer import AdamStep, Rasterizer, RowGradients, VisibleGaussians
 from .rows import aligned_rows, keep_rows
+
+# Mean color error of an image, 0..1, at which the learning rates apply as configured. The mean
+# errors are 0.007 in synthetic scenes and 0.04 in the sequence kitchen. With twice the rates in all
+# iterations, at an effort of 2, the kitchen gains 0.9 dB, but an apartment loses 1.4 dB.
+USUAL_L1 = 0.0125
+# Largest factor on the learning rates. An image of unmapped surface would give up to 9.
+MAX_FACTOR = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +62,17 @@ class AdamConfig:
         groups = ((self.mean_m, 3), (self.log_scale, 3), (self.quat, 4), (self.opacity_logit, 1))
         out = [rate for rate, n in (*groups, (self.color, 3), (0.0, 2)) for _ in range(n)]
         return np.array(out, np.float32)
+
+
+def residual_factor(l1: float) -> float:
+    """Return the factor on all learning rates at a mean color error `l1` of an image, 0..1.
+
+    Steps of Adam hardly depend on the size of the gradient. With constant rates, they are thus too
+    long for a map that nearly explains its images, and too short for one that does not. The factor
+    is for the few iterations after a keyframe. A long refinement has rates that fall to a twentieth
+    anyway, and shorter steps cost it 0.4 dB in an apartment.
+    """
+    return min(sqrt(l1 / USUAL_L1), MAX_FACTOR)
 
 
 def places_of_remaining(old_ids: np.ndarray, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

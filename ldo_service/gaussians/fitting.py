@@ -181,7 +181,7 @@ class Fitting:
         plan: Iterable[int],
         rates: tuple[float, float] = (1.0, 1.0),
         effort: float = inf,
-        starts_half: bool = False,
+        after_keyframe: bool = False,
         observe: Observer | None = None,
     ) -> np.ndarray:
         """Run one iteration for each usable keyframe of the plan.
@@ -194,7 +194,7 @@ class Fitting:
             plan: Keyframes, in the order of the iterations.
             rates: Factors on the learning rates at the first and at the last iteration.
             effort: Limit of the computation; see `GaussianOptimizer.optimize`.
-            starts_half: Start at half resolution; see `GaussianOptimizer.optimize`.
+            after_keyframe: The plan follows a new keyframe; see `GaussianOptimizer.optimize`.
             observe: Function that receives the visible Gaussians of each iteration.
 
         Returns:
@@ -210,7 +210,7 @@ class Fitting:
             rates=rates,
             fixed=first,
             effort=effort,
-            starts_half=starts_half,
+            after_keyframe=after_keyframe,
             observe=observe,
             is_usable=is_usable,
         )

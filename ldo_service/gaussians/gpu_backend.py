@@ -19,7 +19,7 @@ from .exposure import Exposure, ImageBlocks, block_side, fit_blocks
 from .gpu_mirror import GaussianMirror
 from .loss import ImageLoss, LossWeights
 from .model import GaussianMap
-from .optimizer_backend import CpuBackend, ShapeLimits
+from .optimizer_backend import CpuBackend, Rate, ShapeLimits
 from .renderer import Contributions, Rendering, VisibleGaussians, require_undistorted
 from .training_views import TrainingView
 
@@ -122,11 +122,11 @@ class GpuBackend:
             means = plane_rendering.mean_blocks(self._arrays, rendering, side)
         return fit_blocks(means[:3], means[3], frame.blocks)
 
-    def descend(self, exposure: Exposure, *, rate: float) -> tuple[ImageLoss, VisibleGaussians]:
+    def descend(self, exposure: Exposure, *, rate: Rate) -> tuple[ImageLoss, VisibleGaussians]:
         with device_errors("step"):
             return self._descend(exposure, rate)
 
-    def _descend(self, exposure: Exposure, rate: float) -> tuple[ImageLoss, VisibleGaussians]:
+    def _descend(self, exposure: Exposure, rate: Rate) -> tuple[ImageLoss, VisibleGaussians]:
         frame, rendering, binning = self._last()
         weights = self._weights
         by_planes, (l1, d_ssim, depth, squared) = frame_loss.image_loss(
@@ -136,6 +136,9 @@ class GpuBackend:
             exposure.matrix,
             (weights.l1, weights.d_ssim, weights.depth),
         )
+        total = weights.l1 * l1 + weights.d_ssim * d_ssim + weights.depth * depth
+        psnr_db = -10 * log10(max(squared, 1e-20))
+        loss = ImageLoss(total, l1, d_ssim, depth, psnr_db)
         mirror, config = self.mirror, self._config
         adam = descent.AdamState(
             mirror.moments,
@@ -152,7 +155,7 @@ class GpuBackend:
             rendering,
             by_planes,
             adam=adam,
-            rates=config.rates() * np.float32(rate),
+            rates=config.rates() * np.float32(rate(loss)),
             needle_weight=self._limits.needle_weight,
             needle_ratio=self._limits.max_needle_ratio,
             max_sigma_px=self._limits.max_sigma_px / binning,
@@ -162,15 +165,13 @@ class GpuBackend:
             self._arrays.download(made.weights) * np.float32(binning**2),
             made.xi,
         )
-        total = weights.l1 * l1 + weights.d_ssim * d_ssim + weights.depth * depth
         if not np.isfinite([total, squared, *made.xi]).all():
             # The pose would not be rigid in the next iteration.
             raise DeviceError(
                 "the GPU computed NaN or infinity in the loss or in its derivative with respect to "
                 "the pose. If this happens again, set service.device=cpu."
             )
-        psnr_db = -10 * log10(max(squared, 1e-20))
-        return ImageLoss(total, l1, d_ssim, depth, psnr_db), visible
+        return loss, visible
 
     def _last(self) -> tuple[ResidentFrame, plane_rendering.PlaneRendering, int]:
         assert self._rendered is not None, "render comes first"

@@ -122,7 +122,7 @@ def iterate(
     backend.begin(gaussians)
     backend.render(view, is_half=is_half)
     exposure = backend.estimate_exposure()
-    loss, visible = backend.descend(exposure or Exposure(), rate=1.0)
+    loss, visible = backend.descend(exposure or Exposure(), rate=lambda _: 1.0)
     backend.end()
     state, weights = backend.snapshot(), np.zeros(len(rows), np.float32)
     weights[visible.indices] = visible.weights

@@ -206,8 +206,12 @@ class KeyframeViews:
         self.exposures: dict[int, Exposure] = {}
         self.horizons: dict[int, MaxDepthGrid] = {}
 
-    def add(self, view: TrainingView) -> list[int]:
+    def add(self, view: TrainingView, horizon: MaxDepthGrid) -> list[int]:
         """Add the newest keyframe.
+
+        Args:
+            view: The keyframe.
+            horizon: Largest depths in the blocks of its depth image.
 
         Returns:
             The keyframes whose images the store has dropped; only their poses remain.
@@ -216,7 +220,7 @@ class KeyframeViews:
             self.store.keep_only(())  # Drop images of an earlier run in the folder.
         self.store.put(KeyframeImages.of(view))
         self[view.keyframe] = view
-        self.horizons[view.keyframe] = MaxDepthGrid.of(view.depth_m)
+        self.horizons[view.keyframe] = horizon
         return self._forgotten(view.keyframe)
 
     def _forgotten(self, newest: int) -> list[int]:

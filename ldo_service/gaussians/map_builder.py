@@ -97,7 +97,8 @@ class MapBuilder:
                 Most iterations run at half resolution.
             dynamic_mask: Pixels of moving objects, which are not mapped, [H, W] bool; None if none.
         """
-        self._load_visible(PlacedCamera(frame.camera, T_map_camera, MaxDepthGrid.of(frame.depth_m)))
+        horizon = MaxDepthGrid.of(frame.depth_m)
+        self._load_visible(PlacedCamera(frame.camera, T_map_camera, horizon))
         self._renderer.forget()
         before = self.render_from(frame.camera, T_map_camera)
         counts = None if dynamic_mask is None else (~dynamic_mask).astype(np.uint8)
@@ -106,12 +107,12 @@ class MapBuilder:
         self._insert(frame, T_map_camera, keyframe, before, view.exposure, dynamic_mask)
         self._published.add(keyframe, T_map_camera)
         self._newest = keyframe
-        for forgotten in self.views.add(view):
+        for forgotten in self.views.add(view, horizon):
             self._published.forget(forgotten)
             self.fitting.forget_view(forgotten)
         check = self._confirmation.start(keyframe, len(self.gaussians))
         plan = self.fitting.plan(view, MAX_ITERATIONS_PER_EFFORT * iterations, check.keyframes)
-        touched = self._fit(plan, effort=iterations, starts_half=True, observe=check.observe)
+        touched = self._fit(plan, effort=iterations, after_keyframe=True, observe=check.observe)
         mask = check.hidden_mask(self.gaussians.anchors)
         if len(self.views) % self.config.prune_keyframes == 0:
             mask |= self._misshapen_mask(touched)
@@ -227,10 +228,10 @@ class MapBuilder:
         plan: Iterable[int],
         rates: tuple[float, float] = (1.0, 1.0),
         effort: float = inf,
-        starts_half: bool = False,
+        after_keyframe: bool = False,
         observe: Observer | None = None,
     ) -> np.ndarray:
-        touched = self.fitting.fit(self.gaussians, plan, rates, effort, starts_half, observe)
+        touched = self.fitting.fit(self.gaussians, plan, rates, effort, after_keyframe, observe)
         self._log.changed(touched)
         return touched
 

@@ -12,7 +12,7 @@ from ldo_service.errors import ConfigError, DeviceError, named
 from ldo_service.geometry import Camera, se3
 from ldo_service.kernels.gpu.device import Device
 
-from .adam import AdamConfig
+from .adam import AdamConfig, residual_factor
 from .device_choice import choose_backend, given
 from .exposure import Exposure
 from .loss import ImageLoss, LossWeights
@@ -56,7 +56,7 @@ class GaussianOptimizerConfig:
 
     # Fraction of the computing time after a new keyframe that is spent on iterations at half
     # resolution, before those at full resolution. Iterations at half resolution improve the map
-    # almost as much.
+    # almost as much. All iterations are at half resolution if the rest of the effort is below 1.
     half_share: float = 0.8
     # Number of visible Gaussians at which an iteration is assumed to spend half of its time on the
     # pixels and half on the Gaussians. The effort of an iteration is computed from it.
@@ -168,7 +168,7 @@ class GaussianOptimizer:
         rates: tuple[float, float] = (1.0, 1.0),
         fixed: int | None = None,
         effort: float = inf,
-        starts_half: bool = False,
+        after_keyframe: bool = False,
         observe: Observer | None = None,
         is_usable: Callable[[int], bool] = lambda _: True,
     ) -> list[ImageLoss]:
@@ -190,7 +190,10 @@ class GaussianOptimizer:
                 Gaussians, an iteration takes (1 + r) / 2 units. At half resolution, this number of
                 units is multiplied by HALF_EFFORT.
                 No iteration starts once the sum has reached `effort`.
-            starts_half: Start at half resolution, for the fraction `half_share` of `effort`.
+            after_keyframe: The plan follows a new keyframe. The learning rates then change with the
+                color error of each image; see `residual_factor`. The iterations start at half
+                resolution, for the fraction `half_share` of `effort`, or for all of it if less than
+                1 unit would remain.
             observe: Function that is called after each iteration with the keyframe and the visible
                 Gaussians; None for none.
             is_usable: Function that returns whether the map may be fitted to a keyframe now. It is
@@ -200,7 +203,7 @@ class GaussianOptimizer:
         Returns:
             Loss before each step, for the iterations that were run.
         """
-        options = rates, fixed, effort, starts_half
+        options = rates, fixed, effort, after_keyframe
         if self._backend.can_fail:
             attempt, poses = PlanAttempt(views, observe), self._poses.snapshot()
             try:
@@ -279,12 +282,12 @@ class GaussianOptimizer:
         rates: tuple[float, float],
         fixed: int | None,
         effort: float,
-        starts_half: bool,
+        after_keyframe: bool,
         observe: Observer | None,
         is_usable: Callable[[int], bool],
     ) -> list[ImageLoss]:
         losses, spent = [], 0.0
-        half_effort = self.config.half_share * effort if starts_half else 0.0
+        half_effort = self._half_effort(effort) if after_keyframe else 0.0
         for rate, keyframe in zip(np.geomspace(*rates, len(plan)), plan, strict=True):
             if spent >= effort:
                 break
@@ -293,7 +296,7 @@ class GaussianOptimizer:
             view = views[keyframe]
             side_px = min(view.camera.width, view.camera.height)
             is_half = spent < half_effort and side_px >= MIN_HALVED_PX
-            step = self._step(view, rate, keyframe == fixed, is_half)
+            step = self._step(view, rate, keyframe == fixed, is_half, after_keyframe)
             if step.view is not view:
                 views[keyframe] = step.view
             if observe is not None:
@@ -302,6 +305,14 @@ class GaussianOptimizer:
             full = (1 + len(step.visible.indices) / self.config.usual_reach) / 2
             spent += HALF_EFFORT * full if is_half else full
         return losses
+
+    def _half_effort(self, effort: float) -> float:
+        """Return the part of a limited `effort` that is spent on iterations at half resolution.
+
+        All of it is, if the rest is too small for a whole iteration at full resolution.
+        """
+        share = self.config.half_share
+        return effort if (1 - share) * effort < 1 else share * effort
 
     def step(
         self,
@@ -325,15 +336,18 @@ class GaussianOptimizer:
             DeviceError: The device failed. The map and the moments of its Gaussians are unchanged.
         """
         with self._begun(gaussians):
-            return self._step(view, rate, is_fixed, is_half)
+            return self._step(view, rate, is_fixed, is_half, False)
 
     def _step(
-        self, view: TrainingView, rate: float, is_fixed: bool, is_half: bool
+        self, view: TrainingView, rate: float, is_fixed: bool, is_half: bool, follows_error: bool
     ) -> IterationResult:
         self._backend.render(view, is_half=is_half)
         if not is_fixed:
             view = self._exposed(view)
-        loss, visible = self._backend.descend(view.exposure, rate=rate)
+        loss, visible = self._backend.descend(
+            view.exposure,
+            rate=lambda loss: rate * (residual_factor(loss.l1) if follows_error else 1.0),
+        )
         if not is_fixed:
             view = self._placed(view, visible.xi, rate)
         return IterationResult(loss, view, visible)

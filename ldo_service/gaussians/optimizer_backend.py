@@ -1,6 +1,6 @@
 """Backends that run the iterations of the Gaussian optimizer: interface and CPU backend."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -15,6 +15,8 @@ from .model import GaussianMap
 from .prepared_images import PreparedImage, PreparedImages
 from .renderer import Rasterizer, Rendering, RenderMemory, VisibleGaussians, render
 from .training_views import TrainingView
+
+Rate = Callable[[ImageLoss], float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,14 +74,14 @@ class OptimizerBackend(Protocol):
         """Estimate the exposure of the last rendered view; see `exposure.estimate_exposure`."""
         ...
 
-    def descend(self, exposure: Exposure, *, rate: float) -> tuple[ImageLoss, VisibleGaussians]:
+    def descend(self, exposure: Exposure, *, rate: Rate) -> tuple[ImageLoss, VisibleGaussians]:
         """Compare the result of the last `render` with its view, and take a step of Adam.
 
         A backend may change the map now or only in `end`.
 
         Args:
             exposure: Exposure of the view.
-            rate: Factor on all learning rates.
+            rate: Function that returns the factor on all learning rates from the loss.
 
         Returns:
             Loss before the step, and the visible Gaussians. If `can_fail` is False, these are valid
@@ -175,7 +177,7 @@ class CpuBackend:
         prepared, planes, _ = self._last()
         return estimate_block_exposure(planes[:3], planes[4], prepared.blocks)
 
-    def descend(self, exposure: Exposure, *, rate: float) -> tuple[ImageLoss, VisibleGaussians]:
+    def descend(self, exposure: Exposure, *, rate: Rate) -> tuple[ImageLoss, VisibleGaussians]:
         prepared, planes, binning = self._last()
         image = prepared.image
         if self._by_planes.shape != planes.shape:
@@ -194,7 +196,7 @@ class CpuBackend:
             self._map(),
             self._rasterizer,
             self._by_planes,
-            rate=rate,
+            rate=rate(loss),
             needle_weight=self._limits.needle_weight,
             needle_ratio=self._limits.max_needle_ratio,
             max_sigma_px=self._limits.max_sigma_px / binning,

@@ -16,7 +16,7 @@ from ldo_service.gaussians import (
 )
 from ldo_service.gaussians.exposure import Exposure, estimate_exposure
 from ldo_service.gaussians.loss import image_loss
-from ldo_service.gaussians.optimizer_backend import CpuBackend
+from ldo_service.gaussians.optimizer_backend import CpuBackend, Rate
 from ldo_service.gaussians.renderer import AdamStep, Rasterizer, RowGradients
 from ldo_service.geometry import se3
 from ldo_service.kernels import _adam
@@ -145,13 +145,13 @@ class LockstepBackend:
             check("exposure of an iteration to C++", peak(got.matrix, wanted.matrix), self._where)
         return got
 
-    def descend(self, exposure: Exposure, *, rate: float) -> tuple[ImageLoss, VisibleGaussians]:
+    def descend(self, exposure: Exposure, *, rate: Rate) -> tuple[ImageLoss, VisibleGaussians]:
         loss, visible = self.gpu.descend(exposure, rate=rate)
         by_planes, limits = self._compare_loss(loss, exposure), self._config.limits
         penalty = {"needle_weight": limits.needle_weight, "needle_ratio": limits.max_needle_ratio}
         wanted = self._rasterizer.gradients(by_planes, **penalty)
         self._compare_derivatives(visible, wanted)
-        step = replace(self._before, rates=self._before.rates * np.float32(rate))
+        step = replace(self._before, rates=self._before.rates * np.float32(rate(loss)))
         self._compare_step_of_equal_derivatives(visible.indices, step)
         by_rows = wanted.rows.copy()
         max_sigma_px = limits.max_sigma_px / self._binning

@@ -57,6 +57,22 @@ def with_box(frame: RgbdFrame, columns: slice) -> RgbdFrame:
     return RgbdFrame(color, depth_m, CAMERA)
 
 
+@pytest.mark.parametrize("channels", [(), (3,)])
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+def test_mean_of_cells_in_the_middle_rows_is_that_of_their_pixels(
+    channels: tuple[int, ...], dtype: type
+) -> None:
+    """The first row of the cells is no multiple of the largest size."""
+    image = np.random.default_rng(0).uniform(0, 255, (32, 24, *channels)).astype(dtype)
+    row, column = np.array([8, 10, 7, 23]), np.array([4, 20, 23, 0])
+    cells = QuadtreeCells(row, column, np.array([4, 2, 1, 1]))
+    expected = [
+        image[r : r + size, c : c + size].astype(float).mean(axis=(0, 1))
+        for r, c, size in zip(row, column, cells.size, strict=True)
+    ]
+    np.testing.assert_allclose(cells.mean_of(image), expected, rtol=1e-5)
+
+
 @pytest.mark.parametrize("size", [1, 4, 16, 32])
 def test_tiles_of_cells_are_those_of_their_pixels(size: int) -> None:
     height, width, rng = 96, 160, np.random.default_rng(size)

@@ -19,7 +19,7 @@ from ldo_service.gaussians import (
 )
 from ldo_service.gaussians.device_choice import choose_backend
 from ldo_service.gaussians.exposure import Exposure
-from ldo_service.gaussians.optimizer_backend import CpuBackend
+from ldo_service.gaussians.optimizer_backend import CpuBackend, Rate
 from ldo_service.kernels.gpu.arrays import HostArrays
 from ldo_service.kernels.gpu.device import Gpu
 from tests.kernels.gpu.saved_times import save_times
@@ -53,7 +53,7 @@ class FlakyBackend(CpuBackend):
         self._count("render")
         super().render(view, is_half=is_half)
 
-    def descend(self, exposure: Exposure, *, rate: float) -> tuple[ImageLoss, VisibleGaussians]:
+    def descend(self, exposure: Exposure, *, rate: Rate) -> tuple[ImageLoss, VisibleGaussians]:
         self._count("descend")
         loss, visible = super().descend(exposure, rate=rate)
         copies = visible.indices.copy(), visible.weights.copy()
@@ -170,7 +170,7 @@ def test_failed_single_step_changes_no_map(small_room: Callable) -> None:
     before = gaussians.rows.copy()
 
     class LateFailure(FlakyBackend):
-        def descend(self, exposure: Exposure, *, rate: float) -> tuple[ImageLoss, VisibleGaussians]:
+        def descend(self, exposure: Exposure, *, rate: Rate) -> tuple[ImageLoss, VisibleGaussians]:
             super().descend(exposure, rate=rate)
             raise DeviceError("the download failed.")
 

@@ -78,7 +78,7 @@ class Mapping:
             plan,
             fixed=0,
             effort=effort,
-            starts_half=True,
+            after_keyframe=True,
             observe=lambda _, visible: self.weights.append(float(visible.weights.sum())),
         )
         assert len(losses) == len(plan)

@@ -54,7 +54,7 @@ class Refined:
             self.before[keyframe] = T_map_camera
         self.optimizer = self.new_optimizer(on_gpu=on_gpu)
         losses = self.optimizer.optimize(
-            self.gaussians, views, plan, fixed=0, effort=0.6 * len(plan), starts_half=True
+            self.gaussians, views, plan, fixed=0, effort=0.6 * len(plan), after_keyframe=True
         )
         assert len(losses) == len(plan)
         self.losses = np.array([loss.total for loss in losses])

@@ -15,6 +15,7 @@ from ldo_service.gaussians import (
     densify,
     render,
 )
+from ldo_service.gaussians.adam import MAX_FACTOR, USUAL_L1, residual_factor
 from ldo_service.geometry import se3
 
 
@@ -139,6 +140,31 @@ def test_steps_decrease_to_the_final_rate(start: tuple) -> None:
     assert np.abs(gaussians.colors - before).max() < 0.05 * first
 
 
+def test_steps_after_a_keyframe_grow_with_the_root_of_the_color_error(start: tuple) -> None:
+    """The first step of Adam changes a color by its learning rate times the factor."""
+    steps, errors = {False: [], True: []}, []
+    for brightness in (1.0, 0.9):
+        view = start[1][2]
+        views = [replace(view, color=(brightness * view.color).astype(np.uint8))]
+        for after_keyframe, found in steps.items():
+            gaussians = copied(start[0])
+            (loss,) = GaussianOptimizer().optimize(
+                gaussians, views, [0], fixed=0, after_keyframe=after_keyframe
+            )
+            found.append(np.abs(gaussians.colors - start[0].colors).max())
+        errors.append(loss.l1)
+    rate = AdamConfig().color
+    np.testing.assert_allclose(steps[False], rate, rtol=1e-3)
+    np.testing.assert_allclose(steps[True], rate * np.sqrt(np.divide(errors, USUAL_L1)), rtol=1e-3)
+    assert steps[True][1] > 1.1 * steps[True][0]
+
+
+def test_factor_of_the_steps_is_limited() -> None:
+    """Images of unmapped surface are black in the rendering."""
+    assert residual_factor(USUAL_L1) == 1
+    assert residual_factor(0.5) == residual_factor(1.0) == MAX_FACTOR
+
+
 def test_poses_are_not_changed_at_zero_pose_rates(start: tuple) -> None:
     config = GaussianOptimizerConfig(rotation_rate_rad=0.0, translation_rate_m=0.0)
     _, views, _ = optimized(start, config, plan=alternating(4))
@@ -200,12 +226,14 @@ def test_effort_weights_iterations_by_visible_gaussians(start: tuple) -> None:
     assert 1 <= lengths[0] < lengths[1] < lengths[2] <= 16
 
 
-def in_half_resolution(start: tuple, plan: list[int], *, threads: int = 1, **changes) -> tuple:
+def in_half_resolution(
+    start: tuple, plan: list[int], *, threads: int = 1, effort: float = 8, **changes
+) -> tuple:
     """Return map and views after half of the effort at half resolution, and the visible rows."""
     config = replace(GaussianOptimizerConfig(usual_reach=1000, half_share=0.5), **changes)
     gaussians, views, seen = copied(start[0]), list(start[1]), []
     GaussianOptimizer(config, threads=threads).optimize(
-        gaussians, views, plan, fixed=0, effort=8, starts_half=True,
+        gaussians, views, plan, fixed=0, effort=effort, after_keyframe=True,
         observe=lambda _, visible: seen.append((visible.indices.copy(), visible.weights.copy())),
     )  # fmt: skip
     return gaussians, views, seen
@@ -233,6 +261,19 @@ def test_iterations_at_half_resolution_change_pose_and_exposure(
     assert len(seen) == 6
     assert not np.array_equal(views[2].T_map_camera, start[1][2].T_map_camera)
     assert (views[2].exposure.matrix != start[1][2].exposure.matrix).any()
+
+
+def test_effort_below_a_full_iteration_is_spent_at_half_resolution(start: tuple) -> None:
+    """Half of an effort of 1.9 leaves 0.95 units for full resolution, half of 2.1 leaves 1.05."""
+    rows = {
+        (effort, share): in_half_resolution(
+            start, alternating(30), effort=effort, half_share=share
+        )[0].rows
+        for effort in (1.9, 2.1)
+        for share in (0.5, 1.0)
+    }
+    np.testing.assert_array_equal(rows[1.9, 0.5], rows[1.9, 1.0])
+    assert not np.array_equal(rows[2.1, 0.5], rows[2.1, 1.0])
 
 
 def test_size_limit_counts_full_pixels(start: tuple) -> None:
@@ -266,7 +307,8 @@ def test_weights_at_half_resolution_count_full_pixels(start: tuple) -> None:
     )
 
 
-def test_small_images_are_not_halved(start: tuple) -> None:
+def test_small_images_are_not_halved(start: tuple, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ldo_service.gaussians.optimizer.residual_factor", lambda _: 1.0)
     view = start[1][0]
     small = replace(
         view, camera=replace(view.camera, width=20, height=16),
@@ -274,10 +316,10 @@ def test_small_images_are_not_halved(start: tuple) -> None:
         depth_m=np.ascontiguousarray(view.depth_m[:16, :20]),
     )  # fmt: skip
     lengths, rows = [], []
-    for starts_half in (True, False):
+    for after_keyframe in (True, False):
         gaussians = copied(start[0])
         losses = GaussianOptimizer().optimize(
-            gaussians, [small], [0] * 30, effort=4, starts_half=starts_half
+            gaussians, [small], [0] * 30, effort=4, after_keyframe=after_keyframe
         )
         lengths.append(len(losses))
         rows.append(gaussians.rows.copy())
