@@ -182,6 +182,26 @@ void project(const Problem& p, int first, Block& b) {
   }
 }
 
+// Return whether a point of a chunk is inside the image.
+bool shows_points(int first, const Block& b) {
+  float sum = 0.0f;
+  for (int i = 0; i < kChunk; ++i) sum += b.visible[first + i];
+  return sum > 0.0f;
+}
+
+// Set the values of a chunk to 0, which are those of points outside the image.
+void clear(int first, Block& b) {
+  constexpr std::size_t size = sizeof(float) * kChunk;
+  for (float* row : b.rows) {
+    std::memset(row + first, 0, size);
+    std::memset(row + kBlock + first, 0, size);
+  }
+  for (int k = 0; k < 3; ++k) {
+    std::memset(b.photometric[k] + first, 0, size);
+    std::memset(b.geometric[k] + first, 0, size);
+  }
+}
+
 // A register holds whole texels, of kPoints points.
 constexpr int kPoints = kPerRegister / kTexelSize;
 static_assert(kTexelSize == 4);
@@ -436,6 +456,10 @@ Equations normal_equations(const Problem& problem, const std::uint8_t* cells, do
     load(problem, first, block);
     for (int chunk = 0; chunk < kBlock; chunk += kChunk) {
       project(problem, chunk, block);
+      if (!shows_points(chunk, block)) {
+        clear(chunk, block);
+        continue;
+      }
       sample(problem, block);
       weigh_photometric(problem, chunk, block);
       weigh_geometric(problem, chunk, block);

@@ -301,8 +301,9 @@ def depth_gap_m(
         was not measured.
     """
     u, v, z = _seen_from(view, other, T_other_view)
-    is_unknown = other.depth_m <= 0
-    depth_m = np.where(is_unknown, np.float32(NOTHING_M), other.depth_m)
+    measured_m = np.ascontiguousarray(other.depth_m)
+    is_unknown = measured_m <= 0
+    depth_m = np.where(is_unknown, np.float32(NOTHING_M), measured_m)
     nearest_m = cv2.erode(depth_m, _square(config.edge_px))
     nearest_m[is_unknown] = np.nan
     surface_m = cv2.remap(

@@ -171,7 +171,19 @@ def pyramid_of(
         config: Settings.
         motion: Motion of the camera during the frame, to be compensated; None for no compensation.
     """
-    gray, depth_m = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), frame.depth_m
+    return compensated_pyramid(luminance(frame), frame, config, motion)
+
+
+def luminance(frame: RgbdFrame) -> np.ndarray:
+    """Return the gray image of a frame, [H, W] uint8."""
+    return cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
+
+
+def compensated_pyramid(
+    gray: np.ndarray, frame: RgbdFrame, config: PyramidConfig, motion: FrameMotion | None
+) -> Pyramid:
+    """Build the pyramid of a frame whose luminance [H, W] uint8 is known; see `pyramid_of`."""
+    depth_m = frame.depth_m
     if motion is not None and motion.timing:
         gray, depth_m = motion.warped(gray, depth_m, frame.camera)
     return build_pyramid(gray, depth_m, frame.camera, config)

@@ -119,6 +119,24 @@ def test_equations_are_symmetric_and_bitwise_reproducible() -> None:
     assert first[1].tobytes() == second[1].tobytes()
 
 
+BLOCK = 256  # Points whose values the kernel holds at a time.
+
+
+def test_block_of_points_outside_the_image_changes_no_bit() -> None:
+    given = problem()
+    points = given["points"]
+    behind = -points[:, :BLOCK]
+    moved = np.concatenate([points[:, :BLOCK], behind, points[:, BLOCK:]], axis=1)
+    cells = np.zeros(points.shape[1], np.uint8)
+    there = np.concatenate([cells[:BLOCK], np.ones(BLOCK, np.uint8), cells[BLOCK:]])
+    wanted = _align.normal_equations(**given, cells=cells)
+    found = _align.normal_equations(**{**given, "points": moved}, cells=there)
+    assert wanted[2][0] > BLOCK
+    assert found[2] == wanted[2]
+    for a, b in zip((*found[:2], found[3]), (*wanted[:2], wanted[3]), strict=True):
+        assert a.tobytes() == b.tobytes()
+
+
 STRIP = 16  # Consecutive points that are added to the cell of their middle point.
 
 
