@@ -32,7 +32,7 @@ def pose_from_message(pose: Pose) -> np.ndarray:
 
 def matrix6_to_message(matrix: np.ndarray) -> tuple[float, ...]:
     """Return the 36 numbers of a matrix [6, 6], row by row."""
-    return tuple(float(v) for v in np.asarray(matrix).ravel())
+    return tuple(np.asarray(matrix, float).ravel().tolist())
 
 
 def relative_pose_to_message(measured: RelativePose) -> MeasuredPose:

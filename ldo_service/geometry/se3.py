@@ -145,7 +145,15 @@ def adjoint(T: Array) -> Array:
 
 def rotation_angle(T: Array) -> float:
     """Return the rotation angle of T [4, 4] in radians, 0..pi."""
-    return float(rotation_angles(T))
+    (a, b, c), (d, e, f), (g, h, i) = T[:3, :3].tolist()
+    x, y, z = h - f, c - g, d - b
+    return float(np.arctan2(sqrt(x * x + y * y + z * z), a + e + i - 1.0))
+
+
+def distance(T: Array) -> float:
+    """Return the length of the translation of T [4, 4], in meters."""
+    x, y, z = T[:3, 3].tolist()
+    return sqrt(x * x + y * y + z * z)
 
 
 def rotation_angles(T: Array) -> Array:

@@ -19,18 +19,24 @@ constexpr float kDegrees = 5.0f;
 constexpr float kInlierSigma = 3.0f;
 constexpr float kNearest = 1e-3f;  // Meters; closer points are not projected.
 
+constexpr float kAnyDifference = 1e3f;  // Relative tolerance that excludes no gray level.
+
 float smaller(float a, float b) { return a < b ? a : b; }
 float larger(float a, float b) { return a > b ? a : b; }
 
-void halve(const float* values, int width, int height, float tolerance, int least, float* out) {
+// Average 2x2 blocks of the values that `value_of` returns for the pixels.
+template <class Pixel, class ValueOf>
+void halve_pixels(const Pixel* pixels, ValueOf value_of, int width, int height, float tolerance,
+                  int least, float* out) {
   const int w = width / 2, h = height / 2;
   const float missing = 1e30f, reach = 1.0f + tolerance, fewest = static_cast<float>(least);
   for (int y = 0; y < h; ++y) {
-    const float* upper = values + static_cast<std::int64_t>(2 * y) * width;
-    const float* lower = upper + width;
+    const Pixel* upper = pixels + static_cast<std::int64_t>(2 * y) * width;
+    const Pixel* lower = upper + width;
     float* row = out + static_cast<std::int64_t>(y) * w;
     for (int x = 0; x < w; ++x) {
-      const float a = upper[2 * x], b = upper[2 * x + 1], c = lower[2 * x], d = lower[2 * x + 1];
+      const float a = value_of(upper[2 * x]), b = value_of(upper[2 * x + 1]);
+      const float c = value_of(lower[2 * x]), d = value_of(lower[2 * x + 1]);
       const float nearest = smaller(smaller(a > 0 ? a : missing, b > 0 ? b : missing),
                                     smaller(c > 0 ? c : missing, d > 0 ? d : missing));
       const float limit = nearest * reach;
@@ -42,6 +48,19 @@ void halve(const float* values, int width, int height, float tolerance, int leas
       row[x] = count >= fewest ? sum / larger(count, 1.0f) : 0.0f;
     }
   }
+}
+
+void halve(const float* values, int width, int height, float tolerance, int least, float* out) {
+  halve_pixels(
+      values, [](float value) { return value; }, width, height, tolerance, least, out);
+}
+
+void halve_gray(const std::uint8_t* gray, int width, int height, int clipped, int least,
+                float* out) {
+  const auto value_of = [clipped](int level) {
+    return level < clipped ? static_cast<float>(level) : 0.0f;
+  };
+  halve_pixels(gray, value_of, width, height, kAnyDifference, least, out);
 }
 
 // Return the central difference per pixel; 0 if either value is 0, which marks a clipped pixel.
@@ -475,7 +494,7 @@ Equations normal_equations(const Problem& problem, const std::uint8_t* cells, do
 }  // namespace
 
 const Kernels& LDO_ISA() {
-  static const Kernels kernels{halve, pack, normals, points, normal_equations};
+  static const Kernels kernels{halve, halve_gray, pack, normals, points, normal_equations};
   return kernels;
 }
 

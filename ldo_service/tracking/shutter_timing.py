@@ -235,14 +235,14 @@ class TimingEvidence:
             return covariance @ self.prior[:, 3], np.sqrt(np.diag(covariance))
         groups = np.array(self.groups) * (INDEPENDENT_FRACTION * NOISE_RATIO**2)
         total = groups.sum(axis=0)
-        parts = np.array([self._solved(total - group) for group in groups])
+        parts = self._solved(total - groups)
         jackknife = (len(parts) - 1) * np.var(parts, axis=0)
         by_information = np.diag(np.linalg.inv(total[:, :3] + self.prior[:, :3]))
         return self._solved(total), np.sqrt(jackknife + by_information)
 
     def _solved(self, equations: np.ndarray) -> np.ndarray:
         total = equations + self.prior
-        return np.linalg.solve(total[:, :3], total[:, 3])
+        return np.linalg.solve(total[..., :3], total[..., 3:])[..., 0]
 
     def scaled(self, weight: float) -> "TimingEvidence":
         """Return the evidence with the equations of all frames multiplied by a weight."""

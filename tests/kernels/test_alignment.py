@@ -46,6 +46,15 @@ def test_halving_averages_what_lies_near_the_nearest() -> None:
     np.testing.assert_allclose(_align.halve(depth_m, 0.03, 3), enough, rtol=1e-6)
 
 
+@pytest.mark.parametrize("least", [1, 4])
+def test_halved_gray_image_has_no_clipped_pixels(least: int) -> None:
+    gray = np.random.default_rng(0).choice([0, 9, 250, 249, 251], (21, 33)).astype(np.uint8)
+    exposed = np.where(gray < 250, gray, 0).astype(np.float32)
+    expected = _align.halve(exposed, 1e3, least)
+    assert 0 < np.count_nonzero(expected) < expected.size
+    np.testing.assert_array_equal(_align.halve_gray(gray, 250, least), expected)
+
+
 def test_texels_hold_intensity_central_differences_and_depth() -> None:
     rng = np.random.default_rng(1)
     image, depth_m = rng.uniform(0, 255, (2, 11, 14)).astype(np.float32)
