@@ -8,13 +8,14 @@ PAMI 1991).
 from math import atan2, copysign, cos, sin, sqrt
 
 import numpy as np
-from scipy.linalg.lapack import dgesdd
+from scipy.linalg import get_lapack_funcs
 from scipy.spatial.transform import Rotation
 
 Array = np.ndarray
 IDENTITY = np.eye(4)  # It is never changed.
 IDENTITY.setflags(write=False)
 IDENTITY_3 = IDENTITY[:3, :3]
+GESDD = get_lapack_funcs("gesdd", dtype=np.float64)  # Singular value decomposition.
 MAX_ROUNDING = 1e-12  # Largest error of R R^T of a rotation R; a larger one is removed first.
 
 
@@ -124,7 +125,7 @@ def orthonormalize(T: Array) -> Array:
     Raises:
         LinAlgError: The block contains NaN or infinity.
     """
-    U, _, Vt, info = dgesdd(T[:3, :3])  # `np.linalg.svd` takes three times as long.
+    U, _, Vt, info = GESDD(T[:3, :3])  # `np.linalg.svd` takes three times as long.
     if info:
         raise np.linalg.LinAlgError("The SVD of a transform did not converge.")
     U[:, 2] *= np.linalg.det(U @ Vt)

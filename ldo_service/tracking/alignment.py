@@ -78,7 +78,8 @@ class BrightnessModel:
     depth_noise_scale: float = 2.0  # Geometric noise as a multiple of `DepthNoise`.
 
 
-class ResidualStatistics(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class ResidualStatistics:
     """Statistics of the photometric or of the geometric residuals."""
 
     count: float  # Number of residuals.

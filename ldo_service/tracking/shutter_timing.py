@@ -167,11 +167,16 @@ def band_equations(
         depth_noise_scale=NOISE_RATIO * brightness.depth_noise_scale,
     )
     hessians, gradients, rows = [], [], []
-    for first, last in _bands(points, level):
-        band = np.ascontiguousarray(points[:, first:last])
-        row_there, row_here, inside = _rows(band[:, ::ROW_STRIDE], level, T_camera_reference)
+    bands = _bands(points, level)
+    sampled = [np.arange(first, last, ROW_STRIDE) for first, last in bands]
+    every_row = _rows(points[:, np.concatenate(sampled)], level, T_camera_reference)
+    end = 0
+    for (first, last), places in zip(bands, sampled, strict=True):
+        start, end = end, end + len(places)
+        row_there, row_here, inside = (values[start:end] for values in every_row)
         if ROW_STRIDE * np.count_nonzero(inside) < MIN_BAND_POINTS:
             continue
+        band = np.ascontiguousarray(points[:, first:last])
         equations = [
             normal_equations(band, level, T_camera_reference, noise, config)
             for noise in (color, depth)
