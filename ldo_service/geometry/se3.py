@@ -15,7 +15,8 @@ Array = np.ndarray
 IDENTITY = np.eye(4)  # It is never changed.
 IDENTITY.setflags(write=False)
 IDENTITY_3 = IDENTITY[:3, :3]
-GESDD = get_lapack_funcs("gesdd", dtype=np.float64)  # Singular value decomposition.
+# Singular value decomposition.
+(GESDD,) = get_lapack_funcs(("gesdd",), dtype=np.float64)
 MAX_ROUNDING = 1e-12  # Largest error of R R^T of a rotation R; a larger one is removed first.
 
 

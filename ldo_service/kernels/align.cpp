@@ -5,6 +5,7 @@
 
 #include <cmath>
 #include <cstring>
+#include <vector>
 
 #include "transpose.hpp"
 
@@ -24,43 +25,51 @@ constexpr float kAnyDifference = 1e3f;  // Relative tolerance that excludes no g
 float smaller(float a, float b) { return a < b ? a : b; }
 float larger(float a, float b) { return a > b ? a : b; }
 
-// Average 2x2 blocks of the values that `value_of` returns for the pixels.
-template <class Pixel, class ValueOf>
-void halve_pixels(const Pixel* pixels, ValueOf value_of, int width, int height, float tolerance,
-                  int least, float* out) {
-  const int w = width / 2, h = height / 2;
+// Average the 2x2 blocks of two rows to a row of `w` values.
+__attribute__((noinline)) void halve_rows(const float* __restrict upper,
+                                          const float* __restrict lower, int w, float tolerance,
+                                          int least, float* __restrict row) {
   const float missing = 1e30f, reach = 1.0f + tolerance, fewest = static_cast<float>(least);
-  for (int y = 0; y < h; ++y) {
-    const Pixel* upper = pixels + static_cast<std::int64_t>(2 * y) * width;
-    const Pixel* lower = upper + width;
-    float* row = out + static_cast<std::int64_t>(y) * w;
-    for (int x = 0; x < w; ++x) {
-      const float a = value_of(upper[2 * x]), b = value_of(upper[2 * x + 1]);
-      const float c = value_of(lower[2 * x]), d = value_of(lower[2 * x + 1]);
-      const float nearest = smaller(smaller(a > 0 ? a : missing, b > 0 ? b : missing),
-                                    smaller(c > 0 ? c : missing, d > 0 ? d : missing));
-      const float limit = nearest * reach;
-      const float wa = (a > 0) & (a <= limit) ? 1.0f : 0.0f;
-      const float wb = (b > 0) & (b <= limit) ? 1.0f : 0.0f;
-      const float wc = (c > 0) & (c <= limit) ? 1.0f : 0.0f;
-      const float wd = (d > 0) & (d <= limit) ? 1.0f : 0.0f;
-      const float count = wa + wb + wc + wd, sum = wa * a + wb * b + wc * c + wd * d;
-      row[x] = count >= fewest ? sum / larger(count, 1.0f) : 0.0f;
-    }
+  for (int x = 0; x < w; ++x) {
+    const float a = upper[2 * x], b = upper[2 * x + 1], c = lower[2 * x], d = lower[2 * x + 1];
+    const float nearest = smaller(smaller(a > 0 ? a : missing, b > 0 ? b : missing),
+                                  smaller(c > 0 ? c : missing, d > 0 ? d : missing));
+    const float limit = nearest * reach;
+    const float wa = (a > 0) & (a <= limit) ? 1.0f : 0.0f;
+    const float wb = (b > 0) & (b <= limit) ? 1.0f : 0.0f;
+    const float wc = (c > 0) & (c <= limit) ? 1.0f : 0.0f;
+    const float wd = (d > 0) & (d <= limit) ? 1.0f : 0.0f;
+    const float count = wa + wb + wc + wd, sum = wa * a + wb * b + wc * c + wd * d;
+    row[x] = count >= fewest ? sum / larger(count, 1.0f) : 0.0f;
   }
 }
 
 void halve(const float* values, int width, int height, float tolerance, int least, float* out) {
-  halve_pixels(
-      values, [](float value) { return value; }, width, height, tolerance, least, out);
+  const int w = width / 2;
+  for (int y = 0; y < height / 2; ++y) {
+    const float* upper = values + static_cast<std::int64_t>(2 * y) * width;
+    halve_rows(upper, upper + width, w, tolerance, least, out + static_cast<std::int64_t>(y) * w);
+  }
+}
+
+// Convert gray levels to values; clipped ones become 0.
+__attribute__((noinline)) void expose(const std::uint8_t* __restrict gray, int n, int clipped,
+                                      float* __restrict values) {
+  for (int i = 0; i < n; ++i) {
+    const int level = gray[i];
+    values[i] = static_cast<float>(level < clipped ? level : 0);
+  }
 }
 
 void halve_gray(const std::uint8_t* gray, int width, int height, int clipped, int least,
                 float* out) {
-  const auto value_of = [clipped](int level) {
-    return level < clipped ? static_cast<float>(level) : 0.0f;
-  };
-  halve_pixels(gray, value_of, width, height, kAnyDifference, least, out);
+  const int w = width / 2;
+  std::vector<float> rows(2 * static_cast<std::size_t>(width));
+  for (int y = 0; y < height / 2; ++y) {
+    expose(gray + static_cast<std::int64_t>(2 * y) * width, 2 * width, clipped, rows.data());
+    halve_rows(rows.data(), rows.data() + width, w, kAnyDifference, least,
+               out + static_cast<std::int64_t>(y) * w);
+  }
 }
 
 // Return the central difference per pixel; 0 if either value is 0, which marks a clipped pixel.
