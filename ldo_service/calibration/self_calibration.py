@@ -210,7 +210,7 @@ class SelfCalibration:
             return not self._views or self._frames_since_view >= self.config.lost_frames
         T_last_now = se3.inverse(self._T_last_view) @ T_odom_camera
         turned_rad = se3.rotation_angle(T_last_now)
-        parallax_rad = float(se3.distances(T_last_now)) / median_depth_m(raw)
+        parallax_rad = se3.distance(T_last_now) / median_depth_m(raw)
         moved = (turned_rad + parallax_rad) * raw.camera.fx / raw.camera.width
         return moved >= self.config.view_motion
 

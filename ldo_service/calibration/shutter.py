@@ -83,8 +83,8 @@ class FrameMotion:
         if interval_s < MIN_INTERVAL_S:
             return None
         velocity = se3.log(se3.inverse(T_before) @ T_after) / interval_s
-        is_slow = np.linalg.norm(velocity[:3]) < MAX_RAD_PER_S
-        is_slow &= np.linalg.norm(velocity[3:]) < MAX_M_PER_S
+        is_slow = se3.length(velocity[:3]) < MAX_RAD_PER_S
+        is_slow &= se3.length(velocity[3:]) < MAX_M_PER_S
         return FrameMotion(velocity, timing) if is_slow else None
 
     def pack(self) -> dict[str, Any]:
@@ -160,9 +160,9 @@ def displacement_rad(velocity: np.ndarray, timing: ShutterTiming, depth_m: float
         timing: Shutter timing of the camera.
         depth_m: Median depth of the scene, meters.
     """
-    speed = np.linalg.norm(velocity[:3]) + np.linalg.norm(velocity[3:]) / depth_m
+    speed = se3.length(velocity[:3]) + se3.length(velocity[3:]) / depth_m
     color_s = abs(timing.readout_s) / 2
-    return float(speed) * max(color_s, abs(timing.depth_readout_s) / 2 + abs(timing.depth_delay_s))
+    return speed * max(color_s, abs(timing.depth_readout_s) / 2 + abs(timing.depth_delay_s))
 
 
 def _intrinsics(camera: Camera) -> tuple[float, float, float, float]:

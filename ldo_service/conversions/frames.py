@@ -29,7 +29,6 @@ from .poses import (
     matrix6_to_message,
     pose_from_message,
     pose_to_message,
-    poses_to_messages,
     relative_pose_to_message,
 )
 
@@ -87,18 +86,15 @@ def tracked_pose_message(
         T_base_camera: Pose of the camera in the base frame of the robot, [4, 4].
     """
     keyframe = result.keyframe
-    T_odom_camera, T_map_odom, T_reference_camera, T_base = poses_to_messages(
-        result.T_odom_camera, result.T_map_odom, result.T_reference_camera, T_base_camera
-    )
     return TrackedPose(
         stamp_ns=frame.stamp_ns,
         frame=frame.index,
         status=result.status.value,
-        T_odom_camera=T_odom_camera,
-        T_map_odom=T_map_odom,
+        T_odom_camera=pose_to_message(result.T_odom_camera),
+        T_map_odom=pose_to_message(result.T_map_odom),
         graph_version=result.graph_version,
         reference=result.reference,
-        T_reference_camera=T_reference_camera,
+        T_reference_camera=pose_to_message(result.T_reference_camera),
         keyframe=None if keyframe is None else keyframe.id,
         covariance=matrix6_to_message(np.linalg.pinv(result.information, hermitian=True)),
         inlier_fraction=result.inlier_fraction,
@@ -108,7 +104,7 @@ def tracked_pose_message(
         iterations=result.iterations,
         pose_source=result.pose_source,
         hypothesis_spread_rad=result.hypothesis_spread_rad,
-        T_base_camera=T_base,
+        T_base_camera=pose_to_message(T_base_camera),
         submap=result.submap,
     )
 

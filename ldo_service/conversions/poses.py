@@ -21,22 +21,8 @@ from ldo_service.tracking.map_frame import MapCorrection
 
 def pose_to_message(T: np.ndarray) -> Pose:
     """Return the message of a pose T [4, 4]."""
-    return poses_to_messages(T)[0]
-
-
-def poses_to_messages(*T: np.ndarray) -> list[Pose]:
-    """Return the messages of poses T [4, 4].
-
-    One call for several poses is faster than one call for each, because SciPy checks all rotations
-    together.
-    """
-    matrices = np.array(T)
-    translations = matrices[:, :3, 3].tolist()
-    quaternions = se3.quaternion(matrices[:, :3, :3]).tolist()
-    return [
-        Pose((x, y, z), (qw, qx, qy, qz))
-        for (x, y, z), (qw, qx, qy, qz) in zip(translations, quaternions, strict=True)
-    ]
+    (x, y, z), (qw, qx, qy, qz) = T[:3, 3].tolist(), se3.quaternion(T[:3, :3]).tolist()
+    return Pose((x, y, z), (qw, qx, qy, qz))
 
 
 def pose_from_message(pose: Pose) -> np.ndarray:
@@ -46,7 +32,7 @@ def pose_from_message(pose: Pose) -> np.ndarray:
 
 def matrix6_to_message(matrix: np.ndarray) -> tuple[float, ...]:
     """Return the 36 numbers of a matrix [6, 6], row by row."""
-    return tuple(float(v) for v in np.asarray(matrix).ravel())
+    return tuple(np.asarray(matrix, float).ravel().tolist())
 
 
 def relative_pose_to_message(measured: RelativePose) -> MeasuredPose:

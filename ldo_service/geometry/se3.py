@@ -5,14 +5,18 @@ interpolates between pairs of transforms, and fits a transform to corresponding 
 PAMI 1991).
 """
 
-from math import atan2, copysign, sin, sqrt
+from math import atan2, copysign, cos, sin, sqrt
 
 import numpy as np
+from scipy.linalg import get_lapack_funcs
 from scipy.spatial.transform import Rotation
 
 Array = np.ndarray
 IDENTITY = np.eye(4)  # It is never changed.
 IDENTITY.setflags(write=False)
+IDENTITY_3 = IDENTITY[:3, :3]
+# Singular value decomposition.
+(GESDD,) = get_lapack_funcs(("gesdd",), dtype=np.float64)
 MAX_ROUNDING = 1e-12  # Largest error of R R^T of a rotation R; a larger one is removed first.
 
 
@@ -35,12 +39,13 @@ def exp(xi: Array) -> Array:
     if theta < 1e-6:  # Second-order series with an error below 1e-18.
         a, b, c = 1.0 - theta**2 / 6, 0.5 - theta**2 / 24, 1.0 / 6 - theta**2 / 120
     else:
-        a = np.sin(theta) / theta
-        b = 2.0 * (np.sin(theta / 2) / theta) ** 2  # 1 - cos would lose digits near zero.
+        a = sin(theta) / theta
+        b = 2.0 * (sin(theta / 2) / theta) ** 2  # 1 - cos would lose digits near zero.
         c = (1.0 - a) / theta**2
+    bW = b * W
     T = IDENTITY.copy()
-    T[:3, :3] += a * W + b * W @ W
-    T[:3, 3] = (IDENTITY[:3, :3] + b * W + c * W @ W) @ v
+    T[:3, :3] += a * W + bW @ W
+    T[:3, 3] = (IDENTITY_3 + bW + c * W @ W) @ v
     return T
 
 
@@ -52,8 +57,10 @@ def log(T: Array) -> Array:
     if theta < 1e-4:  # The closed form loses digits here; the series is exact to 1e-17.
         d = 1.0 / 12 + theta**2 / 720
     else:
-        d = (1.0 - theta * np.cos(theta / 2) / (2 * np.sin(theta / 2))) / theta**2
-    return np.r_[omega, (IDENTITY[:3, :3] - 0.5 * W + d * W @ W) @ T[:3, 3]]
+        d = (1.0 - theta * cos(theta / 2) / (2 * sin(theta / 2))) / theta**2
+    out = np.empty(6)
+    out[:3], out[3:] = omega, (IDENTITY_3 - 0.5 * W + d * W @ W) @ T[:3, 3]
+    return out
 
 
 def rotation_vector(R: Array) -> Array:
@@ -93,7 +100,7 @@ def _unit_quaternion(R: Array) -> tuple[float, float, float, float]:
         q[n], q[j], q[k] = 1.0 - trace + 2.0 * largest, m[j][n] + m[n][j], m[k][n] + m[n][k]
         (x, y, z), w = q, m[k][j] - m[j][k]
     is_right_handed = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0.5
-    is_exact = is_right_handed and abs(R @ R.T - IDENTITY[:3, :3]).max() < MAX_ROUNDING
+    is_exact = is_right_handed and abs(R @ R.T - IDENTITY_3).max() < MAX_ROUNDING
     if not is_exact or w == 0.0:  # Two quaternions with w = 0 are of one rotation.
         x, y, z, w = Rotation.from_matrix(R).as_quat(canonical=True).tolist()
         return x, y, z, w
@@ -115,8 +122,13 @@ def orthonormalize(T: Array) -> Array:
     """Return a copy of T [4, 4] whose upper left 3x3 block is replaced by the nearest rotation.
 
     This removes the rounding errors that products of transforms accumulate.
+
+    Raises:
+        LinAlgError: The block contains NaN or infinity.
     """
-    U, _, Vt = np.linalg.svd(T[:3, :3])
+    U, _, Vt, info = GESDD(T[:3, :3])  # `np.linalg.svd` takes three times as long.
+    if info:
+        raise np.linalg.LinAlgError("The SVD of a transform did not converge.")
     U[:, 2] *= np.linalg.det(U @ Vt)
     out = IDENTITY.copy()
     out[:3, :3] = U @ Vt
@@ -135,7 +147,15 @@ def adjoint(T: Array) -> Array:
 
 def rotation_angle(T: Array) -> float:
     """Return the rotation angle of T [4, 4] in radians, 0..pi."""
-    return float(rotation_angles(T))
+    (a, b, c), (d, e, f), (g, h, i) = T[:3, :3].tolist()
+    x, y, z = h - f, c - g, d - b
+    return float(np.arctan2(sqrt(x * x + y * y + z * z), a + e + i - 1.0))
+
+
+def distance(T: Array) -> float:
+    """Return the length of the translation of T [4, 4], in meters."""
+    x, y, z = T[:3, 3].tolist()
+    return sqrt(x * x + y * y + z * z)
 
 
 def rotation_angles(T: Array) -> Array:

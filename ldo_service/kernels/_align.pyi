@@ -13,6 +13,11 @@ isa: str
 # 0 for a block with fewer than `least` such values.
 def halve(values: Image, tolerance: float, least: int = 1) -> Image: ...
 
+# Average the 2x2 blocks of a gray image [H, W] to [H // 2, W // 2]. Zeros are missing values, and
+# so are gray levels of at least `clipped`. The result is 0 for a block with fewer than `least`
+# values.
+def halve_gray(gray: NDArray[np.uint8], clipped: int, least: int) -> Image: ...
+
 # Combine gray levels [H, W] (0 where clipped) and depth [H, W] in meters (0 where missing) into
 # texels [H, W, 4]: intensity, two gradients, depth. Depth beyond `max_depth_m` becomes 0.
 def pack(image: Image, depth_m: Image, max_depth_m: float) -> Image: ...

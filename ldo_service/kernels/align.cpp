@@ -5,6 +5,7 @@
 
 #include <cmath>
 #include <cstring>
+#include <vector>
 
 #include "transpose.hpp"
 
@@ -19,28 +20,55 @@ constexpr float kDegrees = 5.0f;
 constexpr float kInlierSigma = 3.0f;
 constexpr float kNearest = 1e-3f;  // Meters; closer points are not projected.
 
+constexpr float kAnyDifference = 1e3f;  // Relative tolerance that excludes no gray level.
+
 float smaller(float a, float b) { return a < b ? a : b; }
 float larger(float a, float b) { return a > b ? a : b; }
 
-void halve(const float* values, int width, int height, float tolerance, int least, float* out) {
-  const int w = width / 2, h = height / 2;
+// Average the 2x2 blocks of two rows to a row of `w` values.
+__attribute__((noinline)) void halve_rows(const float* __restrict upper,
+                                          const float* __restrict lower, int w, float tolerance,
+                                          int least, float* __restrict row) {
   const float missing = 1e30f, reach = 1.0f + tolerance, fewest = static_cast<float>(least);
-  for (int y = 0; y < h; ++y) {
+  for (int x = 0; x < w; ++x) {
+    const float a = upper[2 * x], b = upper[2 * x + 1], c = lower[2 * x], d = lower[2 * x + 1];
+    const float nearest = smaller(smaller(a > 0 ? a : missing, b > 0 ? b : missing),
+                                  smaller(c > 0 ? c : missing, d > 0 ? d : missing));
+    const float limit = nearest * reach;
+    const float wa = (a > 0) & (a <= limit) ? 1.0f : 0.0f;
+    const float wb = (b > 0) & (b <= limit) ? 1.0f : 0.0f;
+    const float wc = (c > 0) & (c <= limit) ? 1.0f : 0.0f;
+    const float wd = (d > 0) & (d <= limit) ? 1.0f : 0.0f;
+    const float count = wa + wb + wc + wd, sum = wa * a + wb * b + wc * c + wd * d;
+    row[x] = count >= fewest ? sum / larger(count, 1.0f) : 0.0f;
+  }
+}
+
+void halve(const float* values, int width, int height, float tolerance, int least, float* out) {
+  const int w = width / 2;
+  for (int y = 0; y < height / 2; ++y) {
     const float* upper = values + static_cast<std::int64_t>(2 * y) * width;
-    const float* lower = upper + width;
-    float* row = out + static_cast<std::int64_t>(y) * w;
-    for (int x = 0; x < w; ++x) {
-      const float a = upper[2 * x], b = upper[2 * x + 1], c = lower[2 * x], d = lower[2 * x + 1];
-      const float nearest = smaller(smaller(a > 0 ? a : missing, b > 0 ? b : missing),
-                                    smaller(c > 0 ? c : missing, d > 0 ? d : missing));
-      const float limit = nearest * reach;
-      const float wa = (a > 0) & (a <= limit) ? 1.0f : 0.0f;
-      const float wb = (b > 0) & (b <= limit) ? 1.0f : 0.0f;
-      const float wc = (c > 0) & (c <= limit) ? 1.0f : 0.0f;
-      const float wd = (d > 0) & (d <= limit) ? 1.0f : 0.0f;
-      const float count = wa + wb + wc + wd, sum = wa * a + wb * b + wc * c + wd * d;
-      row[x] = count >= fewest ? sum / larger(count, 1.0f) : 0.0f;
-    }
+    halve_rows(upper, upper + width, w, tolerance, least, out + static_cast<std::int64_t>(y) * w);
+  }
+}
+
+// Convert gray levels to values; clipped ones become 0.
+__attribute__((noinline)) void expose(const std::uint8_t* __restrict gray, int n, int clipped,
+                                      float* __restrict values) {
+  for (int i = 0; i < n; ++i) {
+    const int level = gray[i];
+    values[i] = static_cast<float>(level < clipped ? level : 0);
+  }
+}
+
+void halve_gray(const std::uint8_t* gray, int width, int height, int clipped, int least,
+                float* out) {
+  const int w = width / 2;
+  std::vector<float> rows(2 * static_cast<std::size_t>(width));
+  for (int y = 0; y < height / 2; ++y) {
+    expose(gray + static_cast<std::int64_t>(2 * y) * width, 2 * width, clipped, rows.data());
+    halve_rows(rows.data(), rows.data() + width, w, kAnyDifference, least,
+               out + static_cast<std::int64_t>(y) * w);
   }
 }
 
@@ -179,6 +207,26 @@ void project(const Problem& p, int first, Block& b) {
     b.corner[i] = iv * p.width + iu, b.nearest[i] = nv * p.width + nu;
     b.column[i] = static_cast<float>(nu), b.row[i] = static_cast<float>(nv);
     b.visible[first + i] = inside ? 1.0f : 0.0f;
+  }
+}
+
+// Return whether a point of a chunk is inside the image.
+bool shows_points(int first, const Block& b) {
+  float sum = 0.0f;
+  for (int i = 0; i < kChunk; ++i) sum += b.visible[first + i];
+  return sum > 0.0f;
+}
+
+// Set the values of a chunk to 0, which are those of points outside the image.
+void clear(int first, Block& b) {
+  constexpr std::size_t size = sizeof(float) * kChunk;
+  for (float* row : b.rows) {
+    std::memset(row + first, 0, size);
+    std::memset(row + kBlock + first, 0, size);
+  }
+  for (int k = 0; k < 3; ++k) {
+    std::memset(b.photometric[k] + first, 0, size);
+    std::memset(b.geometric[k] + first, 0, size);
   }
 }
 
@@ -436,6 +484,10 @@ Equations normal_equations(const Problem& problem, const std::uint8_t* cells, do
     load(problem, first, block);
     for (int chunk = 0; chunk < kBlock; chunk += kChunk) {
       project(problem, chunk, block);
+      if (!shows_points(chunk, block)) {
+        clear(chunk, block);
+        continue;
+      }
       sample(problem, block);
       weigh_photometric(problem, chunk, block);
       weigh_geometric(problem, chunk, block);
@@ -451,7 +503,7 @@ Equations normal_equations(const Problem& problem, const std::uint8_t* cells, do
 }  // namespace
 
 const Kernels& LDO_ISA() {
-  static const Kernels kernels{halve, pack, normals, points, normal_equations};
+  static const Kernels kernels{halve, halve_gray, pack, normals, points, normal_equations};
   return kernels;
 }
 

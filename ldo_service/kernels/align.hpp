@@ -57,6 +57,9 @@ struct Kernels {
   // Average each 2x2 block over the values of at most (1 + `tolerance`) times its lowest value.
   // Zeros are missing values. The result is 0 for a block with fewer than `least` such values.
   void (*halve)(const float* values, int width, int height, float tolerance, int least, float* out);
+  // Average 2x2 blocks of gray levels. Levels of at least `clipped` are missing values, as 0 is.
+  void (*halve_gray)(const std::uint8_t* gray, int width, int height, int clipped, int least,
+                     float* out);
   // Combine an image and its depth into texels. Depth beyond `max_depth` becomes 0. Gradients are
   // central differences, 0 on the border and next to clipped pixels.
   void (*pack)(const float* image, const float* depth, int width, int height, float max_depth,

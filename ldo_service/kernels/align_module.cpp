@@ -22,6 +22,7 @@ namespace {
 
 template <int Dimensions>
 using Input = nb::ndarray<const float, nb::ndim<Dimensions>, nb::c_contig, nb::device::cpu>;
+using Gray = nb::ndarray<const std::uint8_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Output = nb::ndarray<nb::numpy, float>;
 using Cells = nb::ndarray<const std::uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Pose = nb::ndarray<const double, nb::shape<4, 4>, nb::c_contig, nb::device::cpu>;
@@ -101,6 +102,19 @@ Output halve(Input<2> values, double tolerance, int least) {
     nb::gil_scoped_release release;
     chosen->halve(values.data(), static_cast<int>(w), static_cast<int>(h), relative, least,
                   out.get());
+  }
+  return owned(std::move(out), {h / 2, w / 2});
+}
+
+Output halve_gray(Gray gray, int clipped, int least) {
+  const std::size_t h = gray.shape(0), w = gray.shape(1);
+  require_image(h, w);
+  if (least < 1 || least > 4) throw nb::value_error("least must be within 1..4");
+  auto out = floats((h / 2) * (w / 2));
+  {
+    nb::gil_scoped_release release;
+    chosen->halve_gray(gray.data(), static_cast<int>(w), static_cast<int>(h), clipped, least,
+                       out.get());
   }
   return owned(std::move(out), {h / 2, w / 2});
 }
@@ -232,6 +246,7 @@ NB_MODULE(_align, m) {
   chosen = &kernels(isa);
   m.attr("isa") = ldo::name(isa);
   m.def("halve", &halve, "values"_a.noconvert(), "tolerance"_a, "least"_a = 1);
+  m.def("halve_gray", &halve_gray, "gray"_a.noconvert(), "clipped"_a, "least"_a);
   m.def("pack", &pack, "image"_a.noconvert(), "depth_m"_a.noconvert(), "max_depth_m"_a);
   m.def("normals", &normals, "depth_m"_a.noconvert(), "intrinsics"_a, "radius"_a);
   m.def("points", &points, "texels"_a.noconvert(), "normals"_a.noconvert(), "intrinsics"_a);

@@ -6,6 +6,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 #include <vector>
 
 namespace ldo::LDO_ISA {
@@ -156,78 +157,161 @@ __attribute__((noinline)) void find_places(int v, const float* __restrict shift_
   }
 }
 
-// Values of one channel at the four pixels around each place, and 1 if none of them is missing.
+// Consecutive pixels of a row that are read at once if their places are side by side. The image
+// motion is smooth, so this is true of most pixels.
+constexpr int kRun = 16;
+
+// Return whether the indices of kRun pixels ascend by one.
+bool ascends(const int* index) {
+  int differs = 0;
+  for (int k = 0; k < kRun; ++k) differs |= index[k] - index[0] - k;
+  return differs == 0;
+}
+
+bool is_constant(const int* values) {
+  int differs = 0;
+  for (int k = 0; k < kRun; ++k) differs |= values[k] - values[0];
+  return differs == 0;
+}
+
+// The four pixels around each place, with all channels, and 1 if none of them is missing.
 struct Taps {
   std::vector<std::uint8_t> upper_left, upper_right, lower_left, lower_right, valid;
 
-  explicit Taps(int width)
-      : upper_left(width),
-        upper_right(width),
-        lower_left(width),
-        lower_right(width),
+  explicit Taps(int values, int width)
+      : upper_left(values),
+        upper_right(values),
+        lower_left(values),
+        lower_right(values),
         valid(width) {}
 };
 
+// Copy the pixels around the places `u` to `u + n - 1`, which are side by side.
+template <int channels, int n>
+[[gnu::always_inline]] inline void copy_taps(const std::uint8_t* image, int u, const Places& places,
+                                             Taps& t) {
+  const std::uint8_t* a = image + channels * places.corner[u];
+  const std::uint8_t* b = a + channels * places.right[u];
+  const int below = channels * places.below[u];
+  std::memcpy(t.upper_left.data() + channels * u, a, channels * n);
+  std::memcpy(t.upper_right.data() + channels * u, b, channels * n);
+  std::memcpy(t.lower_left.data() + channels * u, a + below, channels * n);
+  std::memcpy(t.lower_right.data() + channels * u, b + below, channels * n);
+}
+
+// Return 1 if a pixel is not black.
 template <int channels>
-void read_taps(const std::uint8_t* image, int channel, int width, const Places& places, Taps& t) {
-  const int *corner = places.corner.data(), *right = places.right.data();
-  const int *below = places.below.data(), *inside = places.inside.data();
-  std::uint8_t *a_out = t.upper_left.data(), *b_out = t.upper_right.data();
-  std::uint8_t *c_out = t.lower_left.data(), *d_out = t.lower_right.data();
-  std::uint8_t* valid = t.valid.data();
+int lit(const std::uint8_t* pixel) {
+  int any = 0;
+  for (int k = 0; k < channels; ++k) any |= pixel[k];
+  return any != 0;
+}
+
+template <int channels>
+__attribute__((noinline)) void find_valid(const std::uint8_t* __restrict a,
+                                          const std::uint8_t* __restrict b,
+                                          const std::uint8_t* __restrict c,
+                                          const std::uint8_t* __restrict d,
+                                          const int* __restrict inside, int width,
+                                          std::uint8_t* __restrict valid) {
   for (int u = 0; u < width; ++u) {
-    const std::uint8_t* a = image + channels * corner[u];
-    const std::uint8_t* b = a + channels * right[u];
-    const std::uint8_t* c = a + channels * below[u];
-    const std::uint8_t* d = c + channels * right[u];
-    a_out[u] = a[channel], b_out[u] = b[channel], c_out[u] = c[channel], d_out[u] = d[channel];
-    if (channel > 0) continue;
-    int lit_a = 0, lit_b = 0, lit_c = 0, lit_d = 0;
-    for (int k = 0; k < channels; ++k) lit_a |= a[k], lit_b |= b[k], lit_c |= c[k], lit_d |= d[k];
-    valid[u] = (lit_a != 0) & (lit_b != 0) & (lit_c != 0) & (lit_d != 0) & inside[u];
+    const int i = channels * u;
+    valid[u] = lit<channels>(a + i) & lit<channels>(b + i) & lit<channels>(c + i) &
+               lit<channels>(d + i) & inside[u];
   }
 }
 
-// Interpolate one channel of a row. A pixel that mixes with a missing one is missing.
+template <int channels>
+void read_taps(const std::uint8_t* image, int width, const Places& places, Taps& t) {
+  const int *corner = places.corner.data(), *right = places.right.data();
+  const int* below = places.below.data();
+  for (int first = 0; first < width; first += kRun) {
+    if (first + kRun <= width && ascends(corner + first) && is_constant(right + first) &&
+        is_constant(below + first)) {
+      copy_taps<channels, kRun>(image, first, places, t);
+      continue;
+    }
+    const int end = std::min(first + kRun, width);
+    for (int u = first; u < end; ++u) copy_taps<channels, 1>(image, u, places, t);
+  }
+  find_valid<channels>(t.upper_left.data(), t.upper_right.data(), t.lower_left.data(),
+                       t.lower_right.data(), places.inside.data(), width, t.valid.data());
+}
+
+// Interpolate a row. A pixel that mixes with a missing one is missing.
+template <int channels>
 __attribute__((noinline)) void interpolate(
     const std::uint8_t* __restrict upper_left, const std::uint8_t* __restrict upper_right,
     const std::uint8_t* __restrict lower_left, const std::uint8_t* __restrict lower_right,
     const std::uint8_t* __restrict valid, const float* __restrict weight_u,
-    const float* __restrict weight_v, int width, int step, std::uint8_t* __restrict out) {
+    const float* __restrict weight_v, int width, std::uint8_t* __restrict out) {
   for (int u = 0; u < width; ++u) {
-    const float a = upper_left[u], b = upper_right[u], c = lower_left[u], d = lower_right[u];
-    const float upper = a + weight_u[u] * (b - a), lower = c + weight_u[u] * (d - c);
-    const int value = static_cast<int>(upper + weight_v[u] * (lower - upper) + 0.5f);
-    out[step * u] = static_cast<std::uint8_t>(value * valid[u]);
+    for (int k = 0; k < channels; ++k) {
+      const int i = channels * u + k;
+      const float a = upper_left[i], b = upper_right[i], c = lower_left[i], d = lower_right[i];
+      const float upper = a + weight_u[u] * (b - a), lower = c + weight_u[u] * (d - c);
+      const int value = static_cast<int>(upper + weight_v[u] * (lower - upper) + 0.5f);
+      out[i] = static_cast<std::uint8_t>(value * valid[u]);
+    }
   }
 }
 
 template <int channels>
 void read_color(const std::uint8_t* image, int width, const Places& places, Taps& t,
                 std::uint8_t* out) {
-  for (int k = 0; k < channels; ++k) {
-    read_taps<channels>(image, k, width, places, t);
-    interpolate(t.upper_left.data(), t.upper_right.data(), t.lower_left.data(),
-                t.lower_right.data(), t.valid.data(), places.weight_u.data(),
-                places.weight_v.data(), width, channels, out + k);
-  }
+  read_taps<channels>(image, width, places, t);
+  interpolate<channels>(t.upper_left.data(), t.upper_right.data(), t.lower_left.data(),
+                        t.lower_right.data(), t.valid.data(), places.weight_u.data(),
+                        places.weight_v.data(), width, out);
 }
 
-// Read a row of depth from the nearest pixels.
-__attribute__((noinline)) void read_depth(const float* depth, int v,
-                                          const float* __restrict shift_u,
-                                          const float* __restrict shift_v,
-                                          const float* __restrict change, int width, int height,
-                                          float* __restrict out) {
+// Pixels of a depth image that a row is read from.
+struct NearestPixels {
+  std::vector<int> index;
+  std::vector<int> inside;  // 1 if the place is in the image.
+  std::vector<float> depth;
+
+  explicit NearestPixels(int width) : index(width), inside(width), depth(width) {}
+};
+
+__attribute__((noinline)) void find_nearest(int v, const float* __restrict shift_u,
+                                            const float* __restrict shift_v, int width, int height,
+                                            int* __restrict index, int* __restrict inside) {
   const float last_u = width - 1.0f, last_v = height - 1.0f;
   for (int u = 0; u < width; ++u) {
     const float x = u + shift_u[u], y = v + shift_v[u];
     const float su = clamped(x, last_u), sv = clamped(y, last_v);
     const int iu = static_cast<int>(su + 0.5f), iv = static_cast<int>(sv + 0.5f);
-    const float z = depth[iv * width + iu];
-    const bool in = (std::fabs(x - su) < 0.5f) & (std::fabs(y - sv) < 0.5f);
-    out[u] = in & (z > 0) ? z * (1.0f - change[u]) : 0.0f;
+    index[u] = iv * width + iu;
+    inside[u] = (std::fabs(x - su) < 0.5f) & (std::fabs(y - sv) < 0.5f) ? 1 : 0;
   }
+}
+
+__attribute__((noinline)) void change_depth(const float* __restrict depth,
+                                            const int* __restrict inside,
+                                            const float* __restrict change, int width,
+                                            float* __restrict out) {
+  for (int u = 0; u < width; ++u) {
+    const float z = depth[u];
+    out[u] = (inside[u] != 0) & (z > 0) ? z * (1.0f - change[u]) : 0.0f;
+  }
+}
+
+// Read a row of depth from the nearest pixels.
+void read_depth(const float* depth, int v, const float* shift_u, const float* shift_v,
+                const float* change, int width, int height, NearestPixels& p, float* out) {
+  find_nearest(v, shift_u, shift_v, width, height, p.index.data(), p.inside.data());
+  for (int first = 0; first < width; first += kRun) {
+    const int* index = p.index.data() + first;
+    float* values = p.depth.data() + first;
+    if (first + kRun <= width && ascends(index)) {
+      std::memcpy(values, depth + index[0], sizeof(float) * kRun);
+      continue;
+    }
+    const int n = std::min(kRun, width - first);
+    for (int k = 0; k < n; ++k) values[k] = depth[index[k]];
+  }
+  change_depth(p.depth.data(), p.inside.data(), change, width, out);
 }
 
 }  // namespace
@@ -256,7 +340,8 @@ void warp(const Frame& frame, int channels, const MovingCamera& camera, const Ro
   const int width = camera.width, height = camera.height;
   Displacement shift(frame.depth, camera, t);
   Places p(width);
-  Taps taps(width);
+  Taps taps(channels * width, width);
+  NearestPixels nearest(width);
   const auto read_row = channels == 1 ? read_color<1> : read_color<3>;
   for (int v = 0; v < height; ++v) {
     const std::int64_t row = static_cast<std::int64_t>(v) * width;
@@ -265,7 +350,7 @@ void warp(const Frame& frame, int channels, const MovingCamera& camera, const Ro
                 p.weight_v.data());
     read_row(frame.image, width, p, taps, out.image + channels * row);
     read_depth(frame.depth, v, shift.depth_u.row(v), shift.depth_v.row(v),
-               shift.depth_change.row(v), width, height, out.depth + row);
+               shift.depth_change.row(v), width, height, nearest, out.depth + row);
   }
 }
 

@@ -18,6 +18,7 @@ and the pose increment xi, which changes the pose to T_reference_camera * exp(xi
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -91,8 +92,7 @@ class ResidualStatistics:
         return self.inliers / self.count if self.count else 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class NormalEquations:
+class NormalEquations(NamedTuple):
     """Gauss-Newton approximation of half the sum of weighted squared residuals.
 
     The order of the unknowns is the pose increment xi [6], gain, bias.

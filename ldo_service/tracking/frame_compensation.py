@@ -14,7 +14,7 @@ from .keyframes import ReferenceKeyframe
 from .motion_segmentation import shows_motion
 from .odometry_config import OdometryConfig
 from .pose_candidates import InitialGuessAligner, PoseHypothesis
-from .pyramid import Pyramid, pyramid_of
+from .pyramid import Pyramid, compensated_pyramid, luminance
 from .shutter import ShutterState, displacement_ratio
 from .shutter_timing import BandEquations, band_equations
 from .state import OdometryState
@@ -38,6 +38,7 @@ class FrameCompensator:
         self.config = config
         self.guesses = guesses
         self._view: tuple[RgbdFrame, Pyramid] | None = None  # The last frame and its pyramid.
+        self._gray: tuple[RgbdFrame, np.ndarray] | None = None  # The last frame, its luminance.
         # Motion that the pyramid compensates; None if the motion of the frame is unknown.
         self._compensated: FrameMotion | None = None
         # Motion during the last frame that its pose was computed for; None if unknown.
@@ -131,12 +132,15 @@ class FrameCompensator:
 
     def forget(self) -> None:
         """Clear the cache of the last frame."""
-        self._view = self.motion = self._compensated = None
+        self._view = self._gray = self.motion = self._compensated = None
 
     def _compensate(self, frame: RgbdFrame, motion: FrameMotion | None) -> Pyramid:
-        self._view = frame, pyramid_of(frame, self.config.pyramid, motion)
+        if self._gray is None or self._gray[0] is not frame:
+            self._gray = frame, luminance(frame)
+        view = compensated_pyramid(self._gray[1], frame, self.config.pyramid, motion)
+        self._view = frame, view
         self.motion = self._compensated = motion
-        return self._view[1]
+        return view
 
     def _interrupt(self, frame: RgbdFrame) -> None:
         """Process a frame whose motion is unknown, without compensation."""

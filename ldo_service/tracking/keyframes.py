@@ -268,7 +268,7 @@ def needs_keyframe(
     """
     if frames < config.min_frames:
         return False
-    translation = se3.distances(T_keyframe_camera) / median_depth_m
+    translation = se3.distance(T_keyframe_camera) / median_depth_m
     rotation_rad = se3.rotation_angle(T_keyframe_camera)
     if max(translation, rotation_rad) < config.still_motion and overlap > config.still_overlap:
         return False  # A robot that stands still must not add keyframes.
@@ -288,7 +288,7 @@ def left_keyframe_view(
         median_depth_m: Median depth of the keyframe.
         config: Limits.
     """
-    is_elsewhere = bool(limit_ratios(T_keyframe_camera, median_depth_m, config) > 1)
+    is_elsewhere = limit_ratio(T_keyframe_camera, median_depth_m, config) > 1
     return is_elsewhere or overlap < config.min_overlap
 
 
@@ -302,24 +302,33 @@ def needs_mapping_keyframe(
         median_depth_m: Median depth of the reference keyframe.
         config: Limits.
     """
-    left = float(limit_ratios(T_mapped_camera, median_depth_m, config))
+    left = limit_ratio(T_mapped_camera, median_depth_m, config)
     return left > config.mapping_only_ratio and config.mapping_only_ratio <= 1
 
 
-def limit_ratios(
-    T_keyframe_camera: np.ndarray, median_depth_m: np.ndarray | float, config: KeyframeConfig
-) -> np.ndarray:
+def limit_ratio(
+    T_keyframe_camera: np.ndarray, median_depth_m: float, config: KeyframeConfig
+) -> float:
     """Return the camera motion since a keyframe as a fraction of the limits in `KeyframeConfig`.
 
     Args:
-        T_keyframe_camera: Poses of the camera in its keyframe, [..., 4, 4].
-        median_depth_m: Median depth of the keyframe, [...].
+        T_keyframe_camera: Pose of the camera in its keyframe, [4, 4].
+        median_depth_m: Median depth of the keyframe.
         config: Settings.
 
     Returns:
         The larger one of (translation / median depth) / max_translation and
-        rotation / max_rotation_rad, [...]. Above 1, a new keyframe is needed.
+        rotation / max_rotation_rad. Above 1, a new keyframe is needed.
     """
+    translation = se3.distance(T_keyframe_camera) / median_depth_m
+    rotation_rad = se3.rotation_angle(T_keyframe_camera)
+    return max(translation / config.max_translation, rotation_rad / config.max_rotation_rad)
+
+
+def limit_ratios(
+    T_keyframe_camera: np.ndarray, median_depth_m: np.ndarray, config: KeyframeConfig
+) -> np.ndarray:
+    """Return the ratios [...] of `limit_ratio` for poses [..., 4, 4] and median depths [...]."""
     translation = se3.distances(T_keyframe_camera) / median_depth_m
     rotation_rad = se3.rotation_angles(T_keyframe_camera)
     return np.maximum(translation / config.max_translation, rotation_rad / config.max_rotation_rad)

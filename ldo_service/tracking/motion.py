@@ -51,7 +51,7 @@ def image_motion_rad(T: np.ndarray, median_depth_m: float) -> float:
     Returns:
         Angle in rad by which T shifts the image at the median depth.
     """
-    return float(image_motions_rad(T, median_depth_m))
+    return se3.rotation_angle(T) + se3.distance(T) / median_depth_m
 
 
 def image_motions_rad(T: np.ndarray, median_depth_m: np.ndarray | float) -> np.ndarray:

@@ -301,15 +301,16 @@ def depth_gap_m(
         was not measured.
     """
     u, v, z = _seen_from(view, other, T_other_view)
-    is_unknown = other.depth_m <= 0
-    depth_m = np.where(is_unknown, np.float32(NOTHING_M), other.depth_m)
+    measured_m = np.ascontiguousarray(other.depth_m)
+    is_unknown = measured_m <= 0
+    depth_m = np.where(is_unknown, np.float32(NOTHING_M), measured_m)
     nearest_m = cv2.erode(depth_m, _square(config.edge_px))
-    nearest_m[is_unknown] = np.nan
-    surface_m = cv2.remap(
+    np.copyto(nearest_m, np.nan, where=is_unknown)
+    gap = cv2.remap(
         nearest_m, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan
     )
-    gap = surface_m - z
-    gap[(view.depth_m <= 0) | (z <= 0)] = np.nan
+    gap -= z
+    np.copyto(gap, np.nan, where=(view.depth_m <= 0) | (z <= 0))
     return gap
 
 
@@ -334,13 +335,18 @@ def _seen_from(
     R, t = T_other_view[:3, :3], T_other_view[:3, 3].astype(np.float32)
     depth_m = np.ascontiguousarray(view.depth_m)
     # NumPy takes several times as long if the three coordinates of a point are side by side.
-    turned = cv2.split(cv2.transform(_rays(view.camera), R.astype(np.float32)))
-    x, y, z = (axis * depth_m + offset for axis, offset in zip(turned, t, strict=True))
-    scale = 1 / np.maximum(z, np.float32(1e-3))
+    x, y, z = cv2.split(cv2.transform(_rays(view.camera), R.astype(np.float32)))
+    for axis, offset in zip((x, y, z), t, strict=True):
+        axis *= depth_m
+        axis += offset
+    scale = np.maximum(z, np.float32(1e-3))
+    np.divide(1, scale, out=scale)
     camera = other.camera
-    u = np.float32(camera.fx) * x * scale + np.float32(camera.cx)
-    v = np.float32(camera.fy) * y * scale + np.float32(camera.cy)
-    return u, v, z
+    for axis, focal, center in ((x, camera.fx, camera.cx), (y, camera.fy, camera.cy)):
+        axis *= np.float32(focal)
+        axis *= scale
+        axis += np.float32(center)
+    return x, y, z
 
 
 @lru_cache(maxsize=8)

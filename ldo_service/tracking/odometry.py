@@ -38,7 +38,7 @@ from .background import with_foreground
 from .frame_tracking import FrameTracker
 from .keyframe_database import KeyframeRecord, make_keyframe_record
 from .keyframe_reuse import KeyframeReuse, ReusedKeyframe, find_nearby_keyframes
-from .keyframes import ReferenceKeyframe, keyframe_dynamic_class_mask, limit_ratios
+from .keyframes import ReferenceKeyframe, keyframe_dynamic_class_mask, limit_ratio
 from .map_frame import MapCorrection, MapFrame
 from .odometry_config import OdometryConfig
 from .odometry_prior import OdometryPriorBuffer, PriorPose
@@ -237,7 +237,7 @@ class Odometry:
             return False
         T_reference_camera = se3.inverse(keyframe.T_odom_keyframe) @ tracked.T_odom_camera
         config, depth_m = self.config.keyframes, keyframe.reference.median_depth_m
-        is_far = float(limit_ratios(T_reference_camera, depth_m, config)) > config.relay_ratio
+        is_far = limit_ratio(T_reference_camera, depth_m, config) > config.relay_ratio
         return is_far or tracked.overlap < config.min_overlap / config.relay_ratio
 
     def _find_reusable_keyframe(

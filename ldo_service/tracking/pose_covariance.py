@@ -33,6 +33,7 @@ from ldo_service.errors import ConfigError, named
 POSE, BRIGHTNESS = slice(0, 6), slice(6, 8)
 # Prior of gain and bias as inverse variances: standard deviations of 3 % and of 3 gray levels.
 BRIGHTNESS_PRIOR = np.array([1e3, 0.1])
+BRIGHTNESS_INFORMATION = np.diag(BRIGHTNESS_PRIOR)
 # Information that is added to the Hessian of the pose: 1 rad and 1 m. It only acts in
 # directions that the residuals do not constrain.
 PRIOR = np.eye(6)
@@ -72,9 +73,13 @@ def without_brightness(hessian: np.ndarray) -> np.ndarray:
     Args:
         hessian: Hessian of pose, gain and bias, [8, 8].
     """
-    brightness = hessian[BRIGHTNESS, BRIGHTNESS] + np.diag(BRIGHTNESS_PRIOR)
-    cross = hessian[POSE, BRIGHTNESS]
-    return hessian[POSE, POSE] - cross @ np.linalg.solve(brightness, cross.T)
+    return hessian[POSE, POSE] - hessian[POSE, BRIGHTNESS] @ _by_brightness(hessian)
+
+
+def _by_brightness(hessian: np.ndarray) -> np.ndarray:
+    """Return the change of gain and bias by a change of the pose, negated, [2, 6]."""
+    brightness = hessian[BRIGHTNESS, BRIGHTNESS] + BRIGHTNESS_INFORMATION
+    return np.linalg.solve(brightness, hessian[BRIGHTNESS, POSE])
 
 
 def pose_covariance(
@@ -91,10 +96,10 @@ def pose_covariance(
             taken as independent.
         config: Settings.
     """
-    brightness = hessian[BRIGHTNESS, BRIGHTNESS] + np.diag(BRIGHTNESS_PRIOR)
-    by_brightness = np.linalg.solve(brightness, hessian[BRIGHTNESS, POSE])
+    by_brightness = _by_brightness(hessian)
     g = gradients[:, POSE] - gradients[:, BRIGHTNESS] @ by_brightness
-    root = _inverse_root(without_brightness(hessian) + PRIOR)
+    H = hessian[POSE, POSE] - hessian[POSE, BRIGHTNESS] @ by_brightness
+    root = _inverse_root(H + PRIOR)
     normalized = g @ root.T
     errors = normalized @ root  # Errors of the pose by the gradient of each group.
     ratio = max(float(np.sum(normalized**2)) / 6, 1.0)
@@ -142,10 +147,9 @@ def contradiction(
         increment has only the directions along which the two poses contradict each other. It is 0
         if there are none.
     """
-    brightness = color_hessian[BRIGHTNESS, BRIGHTNESS] + np.diag(BRIGHTNESS_PRIOR)
-    by_brightness = np.linalg.solve(brightness, color_hessian[BRIGHTNESS, POSE])
+    by_brightness = _by_brightness(color_hessian)
     g_color = color_gradient[POSE] - color_gradient[BRIGHTNESS] @ by_brightness
-    H_color = without_brightness(color_hessian)
+    H_color = color_hessian[POSE, POSE] - color_hessian[POSE, BRIGHTNESS] @ by_brightness
     root = _inverse_root(H_color + depth_hessian + PRIOR)
     share, directions = np.linalg.eigh(root @ H_color @ root.T)
     share = share.clip(1e-6, 1 - 1e-6)

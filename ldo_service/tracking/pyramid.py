@@ -115,12 +115,15 @@ def halved_image(image: np.ndarray, least: int = 1) -> np.ndarray:
     """Halve an image by averaging the valid pixels of 2x2 blocks.
 
     Args:
-        image: Gray levels, [H, W] float32; 0 where invalid.
+        image: Gray levels, [H, W] float32, 0 where invalid; or a gray image, [H, W] uint8, whose
+            overexposed and black pixels are invalid.
         least: Minimum number of valid pixels in a block. A block with fewer becomes 0.
 
     Returns:
         [H//2, W//2] float32.
     """
+    if image.dtype == np.uint8:
+        return _align.halve_gray(np.ascontiguousarray(image), CLIPPED, least)
     return _align.halve(image, ANY_DIFFERENCE, least)
 
 
@@ -142,10 +145,11 @@ def build_pyramid(
     gray: np.ndarray, depth_m: np.ndarray, camera: Camera, config: PyramidConfig
 ) -> Pyramid:
     """Build the pyramid of an image [H, W] uint8 and its depth [H, W] float32 in meters."""
-    image, depth, scaled = mask_clipped(gray), np.ascontiguousarray(depth_m), camera
+    image, depth, scaled = gray, np.ascontiguousarray(depth_m), camera
     levels: list[Level] = []
     while True:
         if scaled.width < 1.5 * config.working_width_px:
+            image = _masked(image)
             levels.append(Level(_align.pack(image, depth, config.max_depth_m), scaled))
         smallest = min(scaled.width, scaled.height) // 2
         if len(levels) == config.levels or smallest < config.min_side_px:
@@ -157,8 +161,13 @@ def build_pyramid(
         image = halved_image(image, least=1 if levels else 4)
         depth, scaled = halved_depth(depth, config.depth_tolerance), scaled.halved()
     if not levels:  # The image is wide and too low to be halved.
-        levels.append(Level(_align.pack(image, depth, config.max_depth_m), scaled))
+        levels.append(Level(_align.pack(_masked(image), depth, config.max_depth_m), scaled))
     return Pyramid(gray, depth_m, camera, tuple(levels))
+
+
+def _masked(image: np.ndarray) -> np.ndarray:
+    """Return gray levels [H, W] float32 of an image that may not have been halved yet."""
+    return mask_clipped(image) if image.dtype == np.uint8 else image
 
 
 def pyramid_of(
@@ -171,7 +180,19 @@ def pyramid_of(
         config: Settings.
         motion: Motion of the camera during the frame, to be compensated; None for no compensation.
     """
-    gray, depth_m = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), frame.depth_m
+    return compensated_pyramid(luminance(frame), frame, config, motion)
+
+
+def luminance(frame: RgbdFrame) -> np.ndarray:
+    """Return the gray image of a frame, [H, W] uint8."""
+    return cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
+
+
+def compensated_pyramid(
+    gray: np.ndarray, frame: RgbdFrame, config: PyramidConfig, motion: FrameMotion | None
+) -> Pyramid:
+    """Build the pyramid of a frame whose luminance [H, W] uint8 is known; see `pyramid_of`."""
+    depth_m = frame.depth_m
     if motion is not None and motion.timing:
         gray, depth_m = motion.warped(gray, depth_m, frame.camera)
     return build_pyramid(gray, depth_m, frame.camera, config)

@@ -167,11 +167,16 @@ def band_equations(
         depth_noise_scale=NOISE_RATIO * brightness.depth_noise_scale,
     )
     hessians, gradients, rows = [], [], []
-    for first, last in _bands(points, level):
-        band = np.ascontiguousarray(points[:, first:last])
-        row_there, row_here, inside = _rows(band[:, ::ROW_STRIDE], level, T_camera_reference)
+    bands = _bands(points, level)
+    sampled = [np.arange(first, last, ROW_STRIDE) for first, last in bands]
+    every_row = _rows(points[:, np.concatenate(sampled)], level, T_camera_reference)
+    end = 0
+    for (first, last), places in zip(bands, sampled, strict=True):
+        start, end = end, end + len(places)
+        row_there, row_here, inside = (values[start:end] for values in every_row)
         if ROW_STRIDE * np.count_nonzero(inside) < MIN_BAND_POINTS:
             continue
+        band = np.ascontiguousarray(points[:, first:last])
         equations = [
             normal_equations(band, level, T_camera_reference, noise, config)
             for noise in (color, depth)
@@ -235,14 +240,14 @@ class TimingEvidence:
             return covariance @ self.prior[:, 3], np.sqrt(np.diag(covariance))
         groups = np.array(self.groups) * (INDEPENDENT_FRACTION * NOISE_RATIO**2)
         total = groups.sum(axis=0)
-        parts = np.array([self._solved(total - group) for group in groups])
+        parts = self._solved(total - groups)
         jackknife = (len(parts) - 1) * np.var(parts, axis=0)
         by_information = np.diag(np.linalg.inv(total[:, :3] + self.prior[:, :3]))
         return self._solved(total), np.sqrt(jackknife + by_information)
 
     def _solved(self, equations: np.ndarray) -> np.ndarray:
         total = equations + self.prior
-        return np.linalg.solve(total[:, :3], total[:, 3])
+        return np.linalg.solve(total[..., :3], total[..., 3:])[..., 0]
 
     def scaled(self, weight: float) -> "TimingEvidence":
         """Return the evidence with the equations of all frames multiplied by a weight."""

@@ -46,6 +46,15 @@ def test_halving_averages_what_lies_near_the_nearest() -> None:
     np.testing.assert_allclose(_align.halve(depth_m, 0.03, 3), enough, rtol=1e-6)
 
 
+@pytest.mark.parametrize("least", [1, 4])
+def test_halved_gray_image_has_no_clipped_pixels(least: int) -> None:
+    gray = np.random.default_rng(0).choice([0, 9, 250, 249, 251], (21, 33)).astype(np.uint8)
+    exposed = np.where(gray < 250, gray, 0).astype(np.float32)
+    expected = _align.halve(exposed, 1e3, least)
+    assert 0 < np.count_nonzero(expected) < expected.size
+    np.testing.assert_array_equal(_align.halve_gray(gray, 250, least), expected)
+
+
 def test_texels_hold_intensity_central_differences_and_depth() -> None:
     rng = np.random.default_rng(1)
     image, depth_m = rng.uniform(0, 255, (2, 11, 14)).astype(np.float32)
@@ -117,6 +126,24 @@ def test_equations_are_symmetric_and_bitwise_reproducible() -> None:
     np.testing.assert_array_equal(first[0], first[0].T)
     assert first[0].tobytes() == second[0].tobytes()
     assert first[1].tobytes() == second[1].tobytes()
+
+
+BLOCK = 256  # Points whose values the kernel holds at a time.
+
+
+def test_block_of_points_outside_the_image_changes_no_bit() -> None:
+    given = problem()
+    points = given["points"]
+    behind = -points[:, :BLOCK]
+    moved = np.concatenate([points[:, :BLOCK], behind, points[:, BLOCK:]], axis=1)
+    cells = np.zeros(points.shape[1], np.uint8)
+    there = np.concatenate([cells[:BLOCK], np.ones(BLOCK, np.uint8), cells[BLOCK:]])
+    wanted = _align.normal_equations(**given, cells=cells)
+    found = _align.normal_equations(**{**given, "points": moved}, cells=there)
+    assert wanted[2][0] > BLOCK
+    assert found[2] == wanted[2]
+    for a, b in zip((*found[:2], found[3]), (*wanted[:2], wanted[3]), strict=True):
+        assert a.tobytes() == b.tobytes()
 
 
 STRIP = 16  # Consecutive points that are added to the cell of their middle point.
