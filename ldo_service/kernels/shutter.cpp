@@ -1,7 +1,8 @@
 // Compensation of the camera's motion during a frame, compiled once per instruction set (LDO_ISA).
 // The kernels run on one thread. Each row takes three steps: the displacement of its pixels, the
-// places that they are read from, and the interpolation. Only the reading is not vectorized. The
-// compiler does not vectorize a loop after it is inlined and `__restrict` is lost.
+// places that they are read from, and the interpolation. Pixels that do not lie side by side are
+// read one by one; the rest is vectorized. The compiler does not vectorize a loop after it is
+// inlined and `__restrict` is lost.
 #include "shutter.hpp"
 
 #include <algorithm>
