@@ -28,6 +28,7 @@ from tests.faults.serve_process import (
     Camera,
     NotObserved,
     Serve,
+    children_of,
     control,
     map_keyframes,
     new_folder,
@@ -39,6 +40,7 @@ from tests.ports import free_port
 READERS = (sys.executable, str(Path(__file__).with_name("map_readers.py")))
 MAX_FILES = 256  # Open files of the service; with 1024, the faults take more connections.
 DAY_S = 86400.0
+MAX_STARTS = 4  # Starts of a process without a connection after which it counts as lost.
 LIGHT = ("mapper.iterations=2", "mapper.threads=1")
 
 
@@ -83,15 +85,16 @@ def empty_messages_of_an_odometry() -> bool:
     return empty_messages_with_keys("odometry", "odometry/prior", "tracker")
 
 
-def ends_with_certificate(until_s: float) -> bool:
+def loses_optimizer(until_s: float) -> bool:
     """Run a service with a certificate that is valid for one day, which does not last for the run.
 
     Args:
         until_s: End of the day, seconds from now.
 
     Returns:
-        Whether the service ends. If it does not, the optimizer, which has a process of its own,
-        must send heartbeats for 20 s while the certificate is not valid.
+        Whether the optimizer, which has a process of its own, loses its connection: the service
+        ends, or starts the process again and again. Otherwise, the optimizer must send heartbeats
+        for 20 s while the certificate is not valid.
     """
     port, start = free_port(), datetime.now(UTC) + timedelta(seconds=until_s - DAY_S)
     invalid_s = time.monotonic() + (until_s if 0 < until_s < DAY_S else 0.0)
@@ -107,35 +110,52 @@ def ends_with_certificate(until_s: float) -> bool:
                 serve.wait("the optimizer runs", has_link)
                 if time.monotonic() > invalid_s:
                     raise NotObserved("the certificate expired before all actors were running")
-            since_s = float("inf")
+            since_s, pids = float("inf"), set[int]()
 
-            def has_had_link() -> bool:
+            def has_result() -> bool:
                 nonlocal since_s
                 now_s = time.monotonic()
-                since_s = min(since_s, now_s) if has_link() else float("inf")
+                if has_link():
+                    since_s = min(since_s, now_s)
+                    pids.clear()
+                else:
+                    since_s = float("inf")
+                    pids.update(processes_of("optimizer", serve))
                 # At the end of the validity, existing connections last for some seconds.
-                return now_s > max(since_s + 20.0, invalid_s + 60.0)
+                return now_s > max(since_s + 20.0, invalid_s + 60.0) or len(pids) >= MAX_STARTS
 
-            ended = serve.ends_before("heartbeats of the optimizer", has_had_link, 300.0)
-            after_s = time.monotonic() - invalid_s
-            code = serve.process.returncode
-            print(f"exit code {code} after {after_s:.0f} s" if ended else "all actors run")
-            return ended and code != 0
+            serve.ends_before("heartbeats of the optimizer", has_result, 800.0)
+            code, after_s = serve.process.poll(), time.monotonic() - invalid_s
+            if len(pids) < MAX_STARTS and code is None:
+                print("all actors run")
+                return False
+            print(f"{len(pids)} starts of the optimizer, exit code {code} after {after_s:.0f} s")
+            return code != 0
+
+
+def processes_of(actor: str, serve: Serve) -> set[int]:
+    """Return the running child processes of a service that run an actor."""
+    pids = set[int]()
+    for pid in children_of(serve.process.pid):
+        with suppress(OSError):
+            if actor.encode() in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0"):
+                pids.add(pid)
+    return pids
 
 
 def expiring_certificate() -> bool:
-    """The service ends after its certificate has expired."""
-    return ends_with_certificate(120.0)
+    """The optimizer loses its connection when the certificate of the service expires."""
+    return loses_optimizer(120.0)
 
 
 def expired_certificate() -> bool:
-    """The service does not start with an expired certificate."""
-    return ends_with_certificate(-DAY_S)
+    """The optimizer does not connect if the certificate of the service is expired."""
+    return loses_optimizer(-DAY_S)
 
 
 def future_certificate() -> bool:
-    """The service does not start with a certificate that is not valid yet."""
-    return ends_with_certificate(2 * DAY_S)
+    """The optimizer does not connect if the certificate of the service is not valid yet."""
+    return loses_optimizer(2 * DAY_S)
 
 
 # --- readers --------------------------------------------------------------------------------------

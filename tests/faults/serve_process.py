@@ -25,7 +25,7 @@ encode, decode = msgspec.msgpack.encode, msgspec.msgpack.decode
 ACTORS = frozenset(
     ("frame_source", "tracker", "detector", "vlm_labeller", "mapper", "loop_closer", "optimizer")
 )
-PATIENCE_S = 120.0  # Time limit of each condition, on an overloaded machine.
+PATIENCE_S = 240.0  # Time limit of each condition, on an overloaded machine.
 PREFIX = "ldo/robot/"
 
 

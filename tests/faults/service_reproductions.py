@@ -14,10 +14,10 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from threading import Thread
-from typing import Any
+from threading import Event, Thread
 
 import numpy as np
+import zenoh
 
 if not __package__:  # The folder comes last, because the installed package may be the old one.
     sys.path.append(str(Path(__file__).resolve().parents[2]))
@@ -180,28 +180,43 @@ def lost_keyframes() -> bool:
             map_keyframes(serve, session, camera, 4)
             camera.period_s = 0.5  # The consumers handle each keyframe before the next one comes.
 
-            def counts() -> tuple[int, int]:
-                outputs = {o["topic"]: o for o in serve.health["tracker"]["outputs"]}
-                tracked = input_count(serve, "tracker", "frame/rgbd", "delivered")
-                return outputs["keyframe/new"][name("evicted_consumers")], tracked
+            def frames_tracked() -> int:
+                return input_count(serve, "tracker", "frame/rgbd", "delivered")
 
+            def evicted() -> int:
+                outputs = {o["topic"]: o for o in serve.health["tracker"]["outputs"]}
+                return outputs["keyframe/new"][name("evicted_consumers")]
+
+            def is_idle() -> bool:
+                return all(health["state"] == "ready" for health in serve.health.values())
+
+            last = since = 0
+
+            def is_stable() -> bool:
+                """Return whether no further consumer was evicted for 30 frames."""
+                nonlocal last, since
+                if evicted() > last:
+                    last, since = evicted(), frames_tracked()
+                return last > 0 and frames_tracked() >= since + 30
+
+            serve.wait("all actors are idle", is_idle)
             with camera.streaming(session):
                 (folder / "lose").touch()
-                serve.wait("a consumer is evicted", lambda: counts()[0] >= 1)
-                time.sleep(10.0)  # All other consumers that can be evicted are evicted too.
+                serve.wait("all consumers that can be evicted are evicted", is_stable)
                 (folder / "lose").unlink()
-                first = counts()[1] + 10  # The first frames may come before the link continues.
-                serve.wait("frames after the loss", lambda: counts()[1] >= first)
+                first = frames_tracked() + 10  # The link may take some frames to continue.
+                serve.wait("frames after the loss", lambda: frames_tracked() >= first)
                 made = serve.metric("tracker", "keyframes")
                 serve.wait(
                     "keyframes after the loss, or many frames without",
                     lambda: (
                         serve.metric("tracker", "keyframes") >= made + 3
-                        or counts()[1] >= first + max_frames
+                        or frames_tracked() >= first + max_frames
                     ),
                 )
             further = serve.metric("tracker", "keyframes") - made
-            print(f"{further:.0f} keyframes in {counts()[1] - first} frames after the loss")
+            after = frames_tracked() - first
+            print(f"{last} evicted; {further:.0f} keyframes in {after} frames after the loss")
             return further == 0
 
 
@@ -216,11 +231,11 @@ def half_reset() -> bool:
                 map_keyframes(serve, session, Camera(scene), 10)
             serve.stop()
         shutil.copytree(folder / "state", folder / "backup")
-        for attempt in range(12):
+        for attempt in range(10):
             shutil.rmtree(folder / "state")
             shutil.copytree(folder / "backup", folder / "state")
             with Serve(folder, settings=settings) as serve, serve.running() as session:
-                is_half = kill_in_reset(serve, session, change=1 + attempt % 3)
+                is_half = kill_in_reset(serve, session, may_be_missing=attempt >= 6)
             if is_half:
                 break
         else:
@@ -249,41 +264,42 @@ def half_reset() -> bool:
             return repeated > 0 or keyframes > made
 
 
-def kill_in_reset(serve: Serve, session: Any, change: int) -> bool:
-    """Kill a service during a reset, when the contents of the tracker's state change.
+def kill_in_reset(serve: Serve, session: zenoh.Session, *, may_be_missing: bool) -> bool:
+    """Kill a service during a reset, as soon as the tracker has an empty state on the disk.
 
     Args:
         serve: The service.
         session: A session.
-        change: Number of the change, counted from the command on.
+        may_be_missing: Whether a tracker without a state counts as one with an empty state.
 
     Returns:
         Whether the tracker was reset, and the mapper was not.
     """
-    path = {
-        actor: serve.state / f"state/{actor}/contents.msgpack" for actor in ("tracker", "mapper")
+    folder, answered = serve.state / "state", Event()
+    sizes = {
+        actor: (folder / actor / "contents.msgpack").stat().st_size
+        for actor in ("tracker", "mapper")
     }
-    sizes = {actor: path[actor].stat().st_size for actor in path}
 
-    def inode() -> int:
-        return path["tracker"].stat().st_ino if path["tracker"].exists() else 0
+    def is_reset(actor: str) -> bool:
+        try:
+            size = (folder / actor / "contents.msgpack").stat().st_size
+        except FileNotFoundError:
+            return may_be_missing
+        return size < 0.9 * sizes[actor]
 
     def kill() -> None:
-        last, left, until_s = inode(), change, time.monotonic() + 60
-        while left and time.monotonic() < until_s:
-            if (now := inode()) != last:
-                last, left = now, left - 1
+        while not is_reset("tracker") and not answered.is_set():
+            pass
         os.kill(serve.process.pid, signal.SIGKILL)
 
     killer = Thread(target=kill)
     killer.start()
-    control(session, "reset", 10.0)
+    control(session, "reset", 20.0)
+    answered.set()
     killer.join()
     serve.kill()
-    new = {
-        actor: not p.exists() or p.stat().st_size < 0.9 * sizes[actor] for actor, p in path.items()
-    }
-    return new["tracker"] and not new["mapper"]
+    return is_reset("tracker") and not is_reset("mapper")
 
 
 def truncated_state() -> bool:
