@@ -25,6 +25,7 @@ if not __package__:  # The folder comes last, because the installed package may 
 from tests.faults.earlier_names import found, name, run
 from tests.faults.reproductions import frames, header
 from tests.faults.serve_process import (
+    LIGHT,
     Camera,
     NotObserved,
     Serve,
@@ -41,7 +42,6 @@ READERS = (sys.executable, str(Path(__file__).with_name("map_readers.py")))
 MAX_FILES = 256  # Open files of the service; with 1024, the faults take more connections.
 DAY_S = 86400.0
 MAX_STARTS = 4  # Starts of a process without a connection after which it counts as lost.
-LIGHT = ("mapper.iterations=2", "mapper.threads=1")
 
 
 # --- keys -----------------------------------------------------------------------------------------
@@ -121,7 +121,7 @@ def loses_optimizer(until_s: float) -> bool:
                 else:
                     since_s = float("inf")
                     pids.update(processes_of("optimizer", serve))
-                # At the end of the validity, existing connections last for some seconds.
+                # Existing connections last for some seconds after the end of the validity.
                 return now_s > max(since_s + 20.0, invalid_s + 60.0) or len(pids) >= MAX_STARTS
 
             serve.ends_before("heartbeats of the optimizer", has_result, 800.0)
@@ -180,7 +180,7 @@ def map_readers() -> bool:
         if not control(session, "pause")[0]:
             raise NotObserved("a command is refused without readers")
         with reader(serve, "readers", 20):
-            time.sleep(5.0)  # All readers are connected and read.
+            time.sleep(5.0)  # The readers connect and read.
             answers = [control(session, ("resume", "pause")[number % 2]) for number in range(20)]
         refused = [text for is_done, text in answers if not is_done]
         print(f"{len(refused)} of {len(answers)} commands not carried out {set(refused) or ''}")

@@ -27,6 +27,9 @@ ACTORS = frozenset(
 )
 PATIENCE_S = 240.0  # Time limit of each condition, on an overloaded machine.
 PREFIX = "ldo/robot/"
+COMMAND = (sys.executable, "-m", "ldo_service")
+CHANGED = (sys.executable, str(Path(__file__).with_name("changed_serve.py")), "serve")
+LIGHT = ("mapper.iterations=2", "mapper.threads=1")  # Settings for little work per keyframe.
 
 
 class NotObserved(Exception):
@@ -66,7 +69,7 @@ class Serve:
         folder: Path,
         *arguments: str,
         settings: Sequence[str] = (),
-        command: Sequence[str] = (sys.executable, "-m", "ldo_service", "serve"),
+        command: Sequence[str] = (*COMMAND, "serve"),
         keys: Path | None = None,
         max_files: int = 0,
         port: int = 0,
@@ -222,6 +225,24 @@ class Serve:
                 if line.startswith("ldo_heartbeat_age_seconds{") and f'actor="{actor}"' in line:
                     return float(line.rpartition(" ")[2])
         return float("inf")
+
+
+def input_count(serve: Serve, actor: str, topic: str, *counters: str) -> int:
+    """Return the sum of counters of an input from the last heartbeat of its actor."""
+    inputs = serve.health[actor]["inputs"]
+    return sum(i[counter] for i in inputs if i["topic"] == topic for counter in counters)
+
+
+def starts_with_code_2(serve: Serve) -> bool:
+    """Return whether a start ends with exit code 2, as for a typing error."""
+    try:
+        with serve.running():
+            print("all actors run")
+            return False
+    except NotObserved:
+        code = serve.exit_code(5.0)
+        print(f"exit code {code}")
+        return code == 2
 
 
 # --- messages of other programs -------------------------------------------------------------------

@@ -8,13 +8,12 @@ neither the fault nor the healthy result ends with an error, without a verdict.
 """
 
 import os
-import shutil
 import signal
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from threading import Event, Thread
+from threading import Thread
 
 import numpy as np
 import zenoh
@@ -26,25 +25,19 @@ from ldo_service.client import connect
 from tests.faults.earlier_names import name, run
 from tests.faults.reproductions import encode, frames, header, image_of
 from tests.faults.serve_process import (
+    CHANGED,
+    LIGHT,
     Camera,
     NotObserved,
     Serve,
-    control,
+    input_count,
     map_keyframes,
     new_folder,
     put,
+    starts_with_code_2,
 )
 
-COMMAND = (sys.executable, "-m", "ldo_service")
-CHANGED = (sys.executable, str(Path(__file__).with_name("changed_serve.py")), "serve")
 STEP_S = 20  # Timeout of a step in the programs with a step that hangs, instead of 60 s.
-LIGHT = ("mapper.iterations=2", "mapper.threads=1")
-
-
-def input_count(serve: Serve, actor: str, topic: str, *counters: str) -> int:
-    """Return the sum of counters of an input from the last heartbeat of its actor."""
-    inputs = serve.health[actor]["inputs"]
-    return sum(i[counter] for i in inputs if i["topic"] == topic for counter in counters)
 
 
 # --- messages -------------------------------------------------------------------------------------
@@ -117,28 +110,46 @@ def forged_log_line() -> bool:
         return forged > 0
 
 
-def foreign_sample() -> bool:
-    """A sample without a header ends the iterator of `Client.messages`."""
+def foreign_samples() -> bool:
+    """A sample without a header, or a malformed one, ends the iterator of `Client.messages`."""
+    with (
+        new_folder() as folder,
+        Serve(folder, settings=LIGHT) as serve,
+        serve.running() as session,
+        Camera(list(frames(20, 3))).streaming(session),
+    ):
+        errors = [
+            error_of_follower(serve, session, body, of_sample)
+            for body, of_sample in ((b"", None), (b"\xc1", header(0)))
+        ]
+    print(f"the iterators ended with {errors}" if any(errors) else "further poses after both")
+    return any(errors)
+
+
+def error_of_follower(
+    serve: Serve, session: zenoh.Session, body: bytes, of_sample: bytes | None
+) -> str:
+    """Send a sample on pose/tracked to a program that follows the poses.
+
+    Returns:
+        Name of the error that ends the iterator; empty if further poses follow.
+    """
     poses, errors = list[int](), list[str]()
-    with new_folder() as folder, Serve(folder, settings=LIGHT) as serve, serve.running() as session:
 
-        def follow() -> None:
-            try:
-                with connect("robot", serve.endpoint) as client:
-                    for _, pose in client.messages("pose/tracked"):
-                        poses.append(pose.stamp_ns)
-            except Exception as error:
-                errors.append(repr(error)[:80])
+    def follow() -> None:
+        try:
+            with connect("robot", serve.endpoint) as client:
+                for _, pose in client.messages("pose/tracked"):
+                    poses.append(pose.stamp_ns)
+        except Exception as error:
+            errors.append(type(error).__name__)
 
-        Thread(target=follow, daemon=True).start()
-        with Camera(list(frames(20, 3))).streaming(session):
-            serve.wait("a pose", lambda: poses)
-            before = len(poses)
-            put(session, "pose/tracked", b"")
-            put(session, "pose/tracked", b"\xc1", header(0))
-            serve.wait("further poses", lambda: errors or len(poses) >= before + 5)
-        print(errors[0] if errors else f"{len(poses) - before} further poses")
-        return bool(errors)
+    Thread(target=follow, daemon=True).start()
+    serve.wait("poses", lambda: poses)
+    put(session, "pose/tracked", body, of_sample)
+    before = len(poses)
+    serve.wait("an error, or further poses", lambda: errors or len(poses) >= before + 5)
+    return errors[0] if errors else ""
 
 
 def frozen_service() -> bool:
@@ -168,7 +179,7 @@ def frozen_service() -> bool:
 
 
 def lost_keyframes() -> bool:
-    """After a loss until the eviction of idle consumers, no keyframe is made any more."""
+    """The tracker makes no keyframe any more after a loss until idle consumers are evicted."""
     settings = (f"{name('service.process_actors')}=[tracker,optimizer]", *LIGHT)
     camera, max_frames = Camera(list(frames(30, 3))), 60
     with new_folder() as folder:
@@ -190,18 +201,21 @@ def lost_keyframes() -> bool:
             def is_idle() -> bool:
                 return all(health["state"] == "ready" for health in serve.health.values())
 
-            last = since = 0
+            serve.wait("all actors are idle", is_idle)
+            serve.forget_heartbeats()
+            serve.wait("heartbeats of idle actors", serve.new_heartbeats)
+            before = last = evicted()  # A slow consumer may have been evicted before.
+            since = 0
 
             def is_stable() -> bool:
                 """Return whether no further consumer was evicted for 30 frames."""
                 nonlocal last, since
                 if evicted() > last:
                     last, since = evicted(), frames_tracked()
-                return last > 0 and frames_tracked() >= since + 30
+                return last > before and frames_tracked() >= since + 30
 
-            serve.wait("all actors are idle", is_idle)
+            (folder / "lose").touch()
             with camera.streaming(session):
-                (folder / "lose").touch()
                 serve.wait("all consumers that can be evicted are evicted", is_stable)
                 (folder / "lose").unlink()
                 first = frames_tracked() + 10  # The link may take some frames to continue.
@@ -215,186 +229,12 @@ def lost_keyframes() -> bool:
                     ),
                 )
             further = serve.metric("tracker", "keyframes") - made
-            after = frames_tracked() - first
-            print(f"{last} evicted; {further:.0f} keyframes in {after} frames after the loss")
+            count = frames_tracked() - first
+            print(f"{last - before} evicted, then {further:.0f} keyframes in {count} frames")
             return further == 0
 
 
-# --- state ----------------------------------------------------------------------------------------
-def half_reset() -> bool:
-    """A kill between the resets of two actors leaves states of different runs, without an error."""
-    settings = (f"{name('mapper.checkpoint_interval_keyframes')}=1", *LIGHT)
-    scene = list(frames(30, 3))
-    with new_folder() as folder:
-        with Serve(folder, settings=settings) as serve:
-            with serve.running() as session:
-                map_keyframes(serve, session, Camera(scene), 10)
-            serve.stop()
-        shutil.copytree(folder / "state", folder / "backup")
-        for attempt in range(10):
-            shutil.rmtree(folder / "state")
-            shutil.copytree(folder / "backup", folder / "state")
-            with Serve(folder, settings=settings) as serve, serve.running() as session:
-                is_half = kill_in_reset(serve, session, may_be_missing=attempt >= 6)
-            if is_half:
-                break
-        else:
-            raise NotObserved("no kill came between the resets of tracker and mapper")
-        with Serve(folder, settings=settings) as serve, serve.running() as session:
-            with Camera(scene).streaming(session):
-                serve.wait(
-                    "new keyframes in the map",
-                    lambda: (
-                        serve.metric("tracker", "keyframes") >= 6
-                        and input_count(serve, "mapper", "keyframe/new", "delivered") >= 6
-                    ),
-                )
-            serve.forget_heartbeats()
-            serve.wait("heartbeats", serve.new_heartbeats)
-            repeated, keyframes = (
-                serve.metric("mapper", of_mapper)
-                for of_mapper in ("keyframes_repeated", "keyframes")
-            )
-            made = serve.metric("tracker", "keyframes")
-            print(
-                f"{made:.0f} keyframes since the reset, {keyframes:.0f} in the map, "
-                f"{repeated:.0f} dropped as repeated"
-            )
-            # The tracker begins anew, so the map has at most the keyframes of the tracker.
-            return repeated > 0 or keyframes > made
-
-
-def kill_in_reset(serve: Serve, session: zenoh.Session, *, may_be_missing: bool) -> bool:
-    """Kill a service during a reset, as soon as the tracker has an empty state on the disk.
-
-    Args:
-        serve: The service.
-        session: A session.
-        may_be_missing: Whether a tracker without a state counts as one with an empty state.
-
-    Returns:
-        Whether the tracker was reset, and the mapper was not.
-    """
-    folder, answered = serve.state / "state", Event()
-    sizes = {
-        actor: (folder / actor / "contents.msgpack").stat().st_size
-        for actor in ("tracker", "mapper")
-    }
-
-    def is_reset(actor: str) -> bool:
-        try:
-            size = (folder / actor / "contents.msgpack").stat().st_size
-        except FileNotFoundError:
-            return may_be_missing
-        return size < 0.9 * sizes[actor]
-
-    def kill() -> None:
-        while not is_reset("tracker") and not answered.is_set():
-            pass
-        os.kill(serve.process.pid, signal.SIGKILL)
-
-    killer = Thread(target=kill)
-    killer.start()
-    control(session, "reset", 20.0)
-    answered.set()
-    killer.join()
-    serve.kill()
-    return is_reset("tracker") and not is_reset("mapper")
-
-
-def truncated_state() -> bool:
-    """A truncated part of a saved state ends every start of the service."""
-    with new_folder() as folder:
-        with Serve(folder, settings=LIGHT) as serve:
-            with serve.running() as session:
-                map_keyframes(serve, session, Camera(list(frames(20, 3))), 4)
-            serve.stop()
-        part = max(
-            (folder / "state/state/tracker").glob("now.*"), key=lambda p: p.stat().st_mtime_ns
-        )
-        body = part.read_bytes()
-        part.unlink()  # The file may have other names, in older generations.
-        part.write_bytes(body[:-20])
-        codes = list[int | None]()
-        for _ in range(2):
-            with Serve(folder, settings=LIGHT) as serve:
-                try:
-                    with serve.running():
-                        serve.wait("a map", lambda: serve.metric("mapper", "keyframes") >= 3)
-                        codes.append(None)
-                        break
-                except NotObserved:
-                    codes.append(serve.exit_code(5.0))
-        print(f"exit codes {codes}" if codes[0] else "the service starts with its map")
-        return codes == [2, 2]
-
-
-def unsynced_files() -> bool:
-    """Files to which a synced state refers are not synced, although the setting promises it."""
-    settings = (
-        f"{name('service.fsync')}=true",
-        f"{name('mapper.offload.max_resident_gaussians')}=500",
-        *LIGHT,
-    )
-    with new_folder() as folder:
-        env = {"FAULT_FOLDER": str(folder)}
-        with (
-            Serve(folder, settings=settings, command=CHANGED, env=env) as serve,
-            serve.running() as session,
-        ):
-            map_keyframes(serve, session, Camera(list(frames(30, 3))), 12)
-            serve.wait("the mapper is idle", lambda: serve.health["mapper"]["state"] == "ready")
-            is_saved, text = control(session, "save")
-            synced = set((folder / "synced").read_text().splitlines())
-            files = {str(path) for path in (serve.state / "map").rglob("*") if path.is_file()}
-            of_state = {path for path in synced if path.startswith(str(serve.state / "state"))}
-            if not (is_saved and files and of_state):
-                raise NotObserved(f"{len(files)} files, {len(of_state)} synced; {text}")
-        print(f"{len(files - synced)} of {len(files)} files of the map are not synced")
-        return bool(files - synced)
-
-
-def second_recording() -> bool:
-    """`ldo record` cannot be started again on the folder of its recording."""
-    with new_folder() as folder:
-        command = (*COMMAND, "record", str(folder / "recording"))
-        with Serve(folder, command=command) as serve, serve.running():
-            serve.kill()
-        with Serve(folder, command=command) as serve:
-            return starts_with_code_2(serve)
-
-
 # --- start ----------------------------------------------------------------------------------------
-def starts_with_code_2(serve: Serve) -> bool:
-    """Return whether a start ends with exit code 2, as for a typing error."""
-    try:
-        with serve.running():
-            print("all actors run")
-            return False
-    except NotObserved:
-        code = serve.exit_code(5.0)
-        print(f"exit code {code}")
-        return code == 2
-
-
-def forgotten_pause() -> bool:
-    """A paused service is no longer paused after a restart."""
-    with new_folder() as folder:
-        paused = list[bool]()
-        for is_first in (True, False):
-            with Serve(folder) as serve, serve.running() as session:
-                if is_first:
-                    control(session, "pause")
-                serve.forget_heartbeats()
-                serve.wait("heartbeats", serve.new_heartbeats)
-                paused.append(serve.health["frame_source"].get(name("paused"), False))
-                serve.stop()
-        if not paused[0]:
-            raise NotObserved("the service is not paused by the command")
-        print(f"paused before the restart: {paused[0]}, after it: {paused[1]}")
-        return not paused[1]
-
-
 def foreign_packages() -> bool:
     """Child processes run packages in the folder in which the service was started."""
     with new_folder() as folder:
@@ -416,12 +256,6 @@ def foreign_packages() -> bool:
         return ran.exists()
 
 
-def used_state() -> bool:
-    """A start on a used state folder has exit code 2, as for a typing error."""
-    with new_folder() as folder, Serve(folder) as first, first.running(), Serve(folder) as second:
-        return starts_with_code_2(second)
-
-
 def missing_router() -> bool:
     """A start as the client of a missing router has exit code 2, as for a typing error."""
     with new_folder() as folder, Serve(folder, name("--client")) as serve:
@@ -434,16 +268,10 @@ PROGRAMS: dict[str, Callable[[], bool]] = {
         empty_messages,
         odd_cameras,
         forged_log_line,
-        foreign_sample,
+        foreign_samples,
         frozen_service,
         lost_keyframes,
-        half_reset,
-        truncated_state,
-        unsynced_files,
-        second_recording,
-        forgotten_pause,
         foreign_packages,
-        used_state,
         missing_router,
     )
 }

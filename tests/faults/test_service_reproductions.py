@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from . import connection_reproductions, service_reproductions
+from . import connection_reproductions, service_reproductions, state_reproductions
 from .earlier_names import MAX_S, outcome
 
 PROGRAMS = [
     (module.__file__, program)
-    for module in (service_reproductions, connection_reproductions)
+    for module in (service_reproductions, state_reproductions, connection_reproductions)
     for program in module.PROGRAMS
 ]
 
