@@ -180,7 +180,12 @@ def frozen_service() -> bool:
 
 def lost_keyframes() -> bool:
     """The tracker makes no keyframe any more after a loss until idle consumers are evicted."""
-    settings = (f"{name('service.process_actors')}=[tracker,optimizer]", *LIGHT)
+    settings = (
+        f"{name('service.process_actors')}=[tracker,optimizer]",
+        # The mapper acknowledges each keyframe, so that it is as idle as the other consumers.
+        f"{name('mapper.checkpoint_interval_keyframes')}=1",
+        *LIGHT,
+    )
     camera, max_frames = Camera(list(frames(30, 3))), 60
     with new_folder() as folder:
         env = {"FAULT_FOLDER": str(folder), "EVICT_AFTER_S": "3"}
