@@ -94,6 +94,7 @@ NAMES = {
     "service.process_actors": ("service.process_actors", "service.spawned"),
     "service.shutdown_timeout_s": ("service.shutdown_timeout_s", "service.drain_s"),
     "supervision.step_timeout_s": ("supervision.step_timeout_s", "stage.stall_after_s"),
+    "service.heartbeat_timeout_s": ("service.heartbeat_timeout_s", "service.silent_after_s"),
     "service.fsync": ("service.fsync", "service.sync_state"),
     "mapper.offload.max_resident_gaussians": (
         "mapper.offload.max_resident_gaussians",

@@ -182,6 +182,8 @@ def lost_keyframes() -> bool:
     """The tracker makes no keyframe any more after a loss until idle consumers are evicted."""
     settings = (
         f"{name('service.process_actors')}=[tracker,optimizer]",
+        # A process that starts again on an overloaded machine would heal the link.
+        f"{name('service.heartbeat_timeout_s')}=120",
         # The mapper acknowledges each keyframe, so that it is as idle as the other consumers.
         f"{name('mapper.checkpoint_interval_keyframes')}=1",
         *LIGHT,
@@ -207,6 +209,7 @@ def lost_keyframes() -> bool:
                 return all(health["state"] == "ready" for health in serve.health.values())
 
             serve.wait("all actors are idle", is_idle)
+            pids = {actor: health["pid"] for actor, health in serve.health.items()}
             serve.forget_heartbeats()
             serve.wait("heartbeats of idle actors", serve.new_heartbeats)
             before = last = evicted()  # A slow consumer may have been evicted before.
@@ -233,6 +236,8 @@ def lost_keyframes() -> bool:
                         or frames_tracked() >= first + max_frames
                     ),
                 )
+            if pids != {actor: health["pid"] for actor, health in serve.health.items()}:
+                raise NotObserved("a process of the service was started again")
             further = serve.metric("tracker", "keyframes") - made
             count = frames_tracked() - first
             print(f"{last - before} evicted, then {further:.0f} keyframes in {count} frames")
