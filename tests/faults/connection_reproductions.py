@@ -17,8 +17,6 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from threading import Event, Thread
 
-import zenoh
-
 if not __package__:  # The folder comes last, because the installed package may be the old one.
     sys.path.append(str(Path(__file__).resolve().parents[2]))
 
@@ -34,7 +32,6 @@ from tests.faults.serve_process import (
     map_keyframes,
     new_folder,
     put,
-    wait,
 )
 from tests.ports import free_port
 
@@ -187,33 +184,6 @@ def map_readers() -> bool:
         return bool(refused)
 
 
-def stopped_readers() -> bool:
-    """Three stopped readers of the map delay a command."""
-    with new_folder() as folder, Serve(folder, settings=LIGHT) as serve, serve.running() as session:
-        map_keyframes(serve, session, Camera(list(frames(30, 3))), 30)
-        times_s = [time_of_command(session, command) for command in 3 * ("pause", "resume")]
-        with ExitStack() as stack:
-            readers = [stack.enter_context(reader(serve, "stopped", 5)) for _ in range(3)]
-            for program in readers:
-                assert program.stdin
-                program.stdin.write("go\n")
-                program.stdin.flush()
-            wait("the readers are stopped", lambda: all(is_stopped(one.pid) for one in readers))
-            took_s = time_of_command(session, "pause")
-        print(f"a command takes {took_s:.2f} s, and {max(times_s):.2f} s at most without readers")
-        # The command waits for 3 s and more for each reader if the fault occurs.
-        return took_s > 5.0 + 5 * max(times_s)
-
-
-def time_of_command(session: zenoh.Session, command: str) -> float:
-    """Send a command until it is carried out, and return the seconds that this takes."""
-    return wait(f"the command {command}", lambda: control(session, command)[0])
-
-
-def is_stopped(pid: int) -> bool:
-    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "T"
-
-
 # --- idle connections -----------------------------------------------------------------------------
 def open_files(serve: Serve) -> int:
     return len(os.listdir(f"/proc/{serve.process.pid}/fd"))
@@ -323,7 +293,6 @@ PROGRAMS: dict[str, Callable[[], bool]] = {
         expired_certificate,
         future_certificate,
         map_readers,
-        stopped_readers,
         unsaved_with_idle_readers,
         unsaved_with_idle_tls_connections,
     )
