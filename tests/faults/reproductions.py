@@ -3,8 +3,8 @@
     .venv/bin/python -m tests.faults.reproductions
     .venv/bin/python -m tests.faults.reproductions far_depth
 
-The programs also run at commit 18f9264, in an environment that has the package of that commit. The
-table `NAMES` has the names that were different then.
+The programs also run at commit 18f9264, in an environment that has the package of that commit.
+`earlier_names` has the names that were different then.
 
     git worktree add ../old 18f9264 && python3 -m venv ../old/.venv
     ../old/.venv/bin/pip install ../old && ../old/.venv/bin/python tests/faults/reproductions.py
@@ -12,9 +12,8 @@ table `NAMES` has the names that were different then.
 
 import asyncio
 import logging
-import os
 import random
-import signal
+import re
 import socket
 import subprocess
 import sys
@@ -23,7 +22,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -31,84 +29,31 @@ from unittest import mock
 import msgspec
 import numpy as np
 
-# Present place or name, and that of commit 18f9264.
-NAMES = {
-    "AddLabel": ("ldo_service.schemas:AddLabel", "ldo_service.schemas:LabelAdd"),
-    "RefineMap": ("ldo_service.schemas:RefineMap", "ldo_service.schemas:MapRefine"),
-    "FolderStore": (
-        "ldo_service.storage.state_store:FolderStore",
-        "ldo_service.runtime.state_store:FolderStore",
-    ),
-    "HealthCollector": (
-        "ldo_service.service.metrics:HealthCollector",
-        "ldo_service.metrics:HealthCollector",
-    ),
-    "serve_metrics": (
-        "ldo_service.service.metrics_server:serve_metrics",
-        "ldo_service.metrics:exported",
-    ),
-    "HttpClient": (
-        "ldo_service.detection.labellers.http_endpoint:HttpClient",
-        "ldo_service.semantics.labellers.endpoint:Endpoint",
-    ),
-    "HttpClientConfig": (
-        "ldo_service.detection.labellers.http_endpoint:HttpClientConfig",
-        "ldo_service.semantics.labellers.endpoint:EndpointConfig",
-    ),
-    "MemoryTransport": (
-        "ldo_service.transport.interface:MemoryTransport",
-        "ldo_service.runtime.transport:MemoryTransport",
-    ),
-    "SupervisionConfig": (
-        "ldo_service.runtime.supervision_policy:SupervisionConfig",
-        "ldo_service.runtime.stage_config:StageConfig",
-    ),
-    "initial_rate": ("initial_rate", "first_rate"),
-    "final_rate": ("final_rate", "last_rate"),
-    "dead_lettered": ("dead_lettered", "set_aside"),
-    "evicted_consumers": ("evicted_consumers", "evicted"),
-    "on_saved": ("on_saved", "saved"),
-    "T_prior_base": ("T_prior_base", "T_odom_base"),
-}
+if not __package__:  # The folder comes last, because the installed package may be the old one.
+    sys.path.append(str(Path(__file__).resolve().parents[2]))
 
-
-def is_present() -> bool:
-    """Return whether the installed package has the present names."""
-    with suppress(ImportError):
-        import_module("ldo_service.transport.interface")
-        return True
-    return False
-
-
-IS_OLD = not is_present()
-
-
-def name(present: str) -> str:
-    """Return the name of a field, method or type in the installed package."""
-    return NAMES[present][IS_OLD].rpartition(":")[2]
-
-
-def found(present: str) -> Any:
-    """Return a class or function of the installed package by its present name."""
-    module, _, attribute = NAMES[present][IS_OLD].partition(":")
-    return getattr(import_module(module), attribute)
-
-
-from ldo_service.actors.frame_source import FrameSource  # noqa: E402
-from ldo_service.actors.mapper import Mapper  # noqa: E402
-from ldo_service.actors.tracker import Tracker  # noqa: E402
-from ldo_service.datasets import open_sequence  # noqa: E402
-from ldo_service.runtime import Actor, In, Latest, Lossless, Out  # noqa: E402
-from ldo_service.runtime.mailbox import Mailbox  # noqa: E402
-from ldo_service.runtime.stage import Stage  # noqa: E402
-from ldo_service.schemas import CameraColor, decode  # noqa: E402
-from ldo_service.schemas.topics import (  # noqa: E402
+from ldo_service.actors.frame_source import FrameSource
+from ldo_service.actors.mapper import Mapper
+from ldo_service.actors.tracker import Tracker
+from ldo_service.datasets import open_sequence
+from ldo_service.errors import LdoError
+from ldo_service.runtime import Actor, In, Latest, Lossless, Out
+from ldo_service.runtime.mailbox import Mailbox
+from ldo_service.runtime.process import ChildProcess
+from ldo_service.runtime.stage import Stage
+from ldo_service.runtime.supervision import supervise
+from ldo_service.schemas import CameraColor, CameraRgbd, decode
+from ldo_service.schemas.topics import (
     CAMERA_RGBD,
+    FRAME_RGBD,
     LABEL_ADD,
     MAP_REFINE,
     ODOMETRY_PRIOR,
 )
+from tests.faults.earlier_names import IS_OLD, found, name, run
+from tests.ports import free_port
 
+ROOT = Path(__file__).resolve().parents[2]
 encode = msgspec.msgpack.encode
 WAIT_S = 20.0  # Time within which a service without the fault is expected to continue.
 AddLabel, RefineMap = found("AddLabel"), found("RefineMap")
@@ -232,7 +177,7 @@ def foreign_sequence_numbers() -> bool:
 
 
 class Producer(Actor):
-    """Actor that makes a message for each one that it handles."""
+    """Actor that makes a message for each one, with the stamp as its number of iterations."""
 
     name = "producer"
     inputs = (In(LABEL_ADD, Latest(32)),)
@@ -240,7 +185,8 @@ class Producer(Actor):
 
     def handle(self, message: Any) -> Iterator[Any]:
         rates = {name("initial_rate"): 1.0, name("final_rate"): 1.0}
-        yield RefineMap(stamp_ns=message.stamp_ns, iterations=1, **rates)
+        stamp_ns = message.stamp_ns
+        yield RefineMap(stamp_ns=stamp_ns, iterations=stamp_ns, **rates)
 
 
 class Consumer(Actor):
@@ -295,6 +241,94 @@ def eviction() -> bool:
         return Consumer.handled < 8
 
     return asyncio.run(run())
+
+
+async def deliveries(folder: Path, how: str) -> list[int]:
+    """Send messages 1 to 5 to an actor in a process of its own, which message 3 ends.
+
+    Args:
+        folder: Folder of the state of the actor.
+        how: What message 3 does: crash or hang.
+
+    Returns:
+        The numbers of the messages in the order of their deliveries, when the service has ended or
+        all messages were delivered.
+    """
+    network = found("Endpoint")("robot", f"tcp/127.0.0.1:{free_port()}")
+    stop, path = found("StopRequest")(), folder / "handled"
+    with found("open_session")(network, router=True) as session:
+        transport = found("ZenohTransport")(session, network)
+        consumers = {MAP_REFINE.name: frozenset({"consumer"})}
+        producer = Stage(Producer, transport, expected=consumers)
+        program = Path(__file__).with_name("poison_consumer.py")
+        command = [sys.executable, str(program), network.endpoint, str(folder), "3", how]
+        consumer = ChildProcess("consumer", command, transport)
+        service = asyncio.create_task(supervise([producer, consumer], stop, 2.0))
+        put, until_s = transport.publisher(LABEL_ADD.name), time.monotonic() + 6 * WAIT_S
+        while producer.health().state == "starting" and time.monotonic() < until_s:
+            await asyncio.sleep(0.1)
+        await asyncio.sleep(1.0)
+        for number in range(5):
+            await put.send(b"", add_label(str(number), number + 1))
+        numbers: list[int] = []
+        while not service.done() and 5 not in numbers and time.monotonic() < until_s:
+            await asyncio.sleep(0.1)
+            numbers = list(map(int, path.read_text().split())) if path.exists() else []
+        getattr(stop, name("request"))()
+        await asyncio.gather(service, return_exceptions=True)
+        transport.close()
+    return list(map(int, path.read_text().split()))
+
+
+def poisoned(how: str) -> bool:
+    with tempfile.TemporaryDirectory() as folder:
+        numbers = asyncio.run(deliveries(Path(folder), how))
+    print(f"deliveries of the message: {numbers.count(3)}, of the next one: {numbers.count(4)}")
+    if 1 not in numbers:
+        raise RuntimeError(f"the messages did not arrive: {numbers}")
+    return numbers.count(3) > 3 and 5 not in numbers
+
+
+def crashing_message() -> bool:
+    """A message that crashes the process of its actor is delivered again until the service ends."""
+    return poisoned("crash")
+
+
+def hanging_message() -> bool:
+    """A message that hangs is delivered again until the service ends."""
+    return poisoned("hang")
+
+
+class SlowRunner:
+    """Runner that does not end by itself."""
+
+    def __init__(self, number: int) -> None:
+        self.name = f"slow {number}"
+
+    async def run(self) -> None:
+        await asyncio.Event().wait()
+
+    def drain(self) -> None: ...
+
+    def health(self) -> None: ...
+
+
+def slow_stop() -> bool:
+    """A stop while seven actors do not finish takes seven times `shutdown_timeout_s`."""
+
+    async def stop_s() -> float:
+        stop = found("StopRequest")()
+        runners = [SlowRunner(number) for number in range(7)]
+        service = asyncio.create_task(supervise(runners, stop, 1.0))
+        await asyncio.sleep(0.1)
+        began_s = time.monotonic()
+        getattr(stop, name("request"))()
+        await asyncio.gather(service, return_exceptions=True)
+        return time.monotonic() - began_s
+
+    took_s = asyncio.run(stop_s())
+    print(f"{took_s:.1f} s with a timeout of 1 s for each actor")
+    return took_s > 6.0
 
 
 # --- mailboxes --------------------------------------------------------------------------------
@@ -422,6 +456,61 @@ def is_busy(stages: Sequence[Stage]) -> bool:
     )
 
 
+def largest_image() -> bool:
+    """An image of the documented maximum size never reaches the tracker."""
+    width, megapixels = 4096, documented_megapixels()
+    height = int(0.99e6 * megapixels / width)
+    size = {"width": width, "height": height}
+    camera = size | {"fx": 2e3, "fy": 2e3, "cx": width / 2, "cy": height / 2}
+    message = {"type": "CameraRgbd", "stamp_ns": 1, "frame": 0, "depth_scale": 1.0}
+    message |= {"camera": camera, "color": image_of("rgb8", np.zeros((height, width, 3), np.uint8))}
+    message |= {"depth": image_of("f32", np.ones((height, width), np.float32))}
+    (frame,) = FrameSource().handle(decode(encode(message), CameraRgbd))
+    body = encode(frame)
+
+    async def run() -> int:
+        transport = found("MemoryTransport")()
+        mailbox = Mailbox("tracker", Tracker.inputs, transport)
+        transport.deliver(FRAME_RGBD.name, header(0, "frame_source"), body)
+        return len(mailbox._order)
+
+    waiting = asyncio.run(run())
+    print(f"{megapixels} megapixels, {len(body) / 1e6:.0f} MB, waiting for the tracker: {waiting}")
+    return waiting == 0
+
+
+def documented_megapixels() -> float:
+    """Return the maximum size of an image in the documentation of the installed package."""
+    page = "docs/limits.md"
+    text = (ROOT / page).read_text()
+    if IS_OLD:
+        command = ["git", "show", f"18f9264:{page}"]
+        text = subprocess.check_output(command, cwd=ROOT, text=True)
+    found_size = re.search(r"\| an image \| ([\d.]+) megapixels", text)
+    assert found_size
+    return float(found_size[1])
+
+
+def alternating_clocks() -> bool:
+    """200 frames of two clocks in turn write a line into the log for each change back."""
+    lines: list[str] = []
+    handler = logging.Handler()
+    handler.emit = lambda record: lines.append(record.getMessage())
+    log, source, (frame,) = logging.getLogger("ldo_service"), FrameSource(), frames(1, 1)
+    logging.disable(logging.NOTSET)
+    log.addHandler(handler)
+    try:
+        for number in range(200):
+            stamp_ns = 10**10 * (1 + number % 2) + number
+            message = frame | {"frame": number, "stamp_ns": stamp_ns}
+            list(source.handle(decode(encode(message), CameraRgbd)))
+    finally:
+        log.removeHandler(handler)
+    count = sum("went back" in line for line in lines)
+    print(f"{count} lines")
+    return count > 50
+
+
 def principal_point() -> bool:
     """A camera whose principal point is just inside its limit makes the tracker fail."""
     messages = []
@@ -490,7 +579,7 @@ def silent_addresses() -> bool:
         config = found("HttpClientConfig")(timeout_s=1.0, patience_s=2.0)
         url = f"http://labeller.test:{server.getsockname()[1]}/v1"
         client, begun_s = found("HttpClient")(url, config), time.monotonic()
-        with suppress(Exception):
+        with suppress(LdoError):
             client.post("/chat/completions", b"{}", begun_s + 2.0)
         return time.monotonic() - begun_s > 5.0
 
@@ -507,7 +596,7 @@ def flipped_bits() -> bool:
             body = bytearray(file.read_bytes())
             body[chance.randrange(len(body))] ^= 1 << chance.randrange(8)
             file.write_bytes(body)
-            with suppress(Exception):
+            with suppress(LdoError):
                 loaded += store(Path(folder)).load("counter") is not None
     return loaded > 0
 
@@ -529,11 +618,16 @@ PROGRAMS: dict[str, Callable[[], bool]] = {
         foreign_sequence_numbers,
         three_bad_messages,
         error_after_save,
+        crashing_message,
+        hanging_message,
+        slow_stop,
         damaged_state,
         eviction,
         queued_bytes,
         long_header,
         unpaired_images,
+        largest_image,
+        alternating_clocks,
         principal_point,
         far_depth,
         far_prior,
@@ -545,22 +639,5 @@ PROGRAMS: dict[str, Callable[[], bool]] = {
 }
 
 
-def main() -> None:
-    """Run the programs named on the command line, each in a process of its own; default: all."""
-    logging.disable(logging.CRITICAL)
-    if len(sys.argv) == 2:
-        signal.alarm(120)
-        seen = PROGRAMS[sys.argv[1]]()
-        print("SEEN" if seen else "NOT SEEN", flush=True)
-        os._exit(seen)  # A step of an actor may still hang.
-    verdicts = []
-    for program in sys.argv[1:] or PROGRAMS:
-        command = [sys.executable, str(Path(__file__).resolve()), program]
-        result = subprocess.run(command, capture_output=True, text=True)
-        verdicts.append(result.stdout.strip() or f"ERROR {result.stderr[-300:]}")
-        print(f"{verdicts[-1]:<9} {program}", flush=True)
-    raise SystemExit(set(verdicts) != {"NOT SEEN"})
-
-
 if __name__ == "__main__":
-    main()
+    run(PROGRAMS, __file__)
