@@ -157,14 +157,14 @@ def future_certificate() -> bool:
 
 # --- readers --------------------------------------------------------------------------------------
 @contextmanager
-def reader(serve: Serve, kind: str, number: int) -> Iterator[subprocess.Popen[str]]:
-    """Run a program that reads the map, and yield it when it is connected."""
-    command = [*READERS, serve.endpoint, kind, str(number)]
-    program = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+def readers(serve: Serve, count: int) -> Iterator[None]:
+    """Let `count` readers read the map inside a `with` block."""
+    command = [*READERS, serve.endpoint, str(count)]
+    program = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         assert program.stdout
         assert program.stdout.readline()
-        yield program
+        yield
     finally:
         program.kill()
         program.communicate()
@@ -176,7 +176,7 @@ def map_readers() -> bool:
         map_keyframes(serve, session, Camera(list(frames(30, 3))), 16)
         if not control(session, "pause")[0]:
             raise NotObserved("a command is refused without readers")
-        with reader(serve, "readers", 20):
+        with readers(serve, 20):
             time.sleep(5.0)  # The readers connect and read.
             answers = [control(session, ("resume", "pause")[number % 2]) for number in range(20)]
         refused = [text for is_done, text in answers if not is_done]
