@@ -108,7 +108,7 @@ def stages(backend: OptimizerBackend, view: TrainingView) -> Steps:
         backend.estimate_exposure()
 
     def descent() -> None:
-        backend.descend(Exposure(), rate=0.1)
+        backend.descend(Exposure(), rate=lambda _: 0.1)
 
     return {"rendering and exposure": rendering, "loss and step": descent}
 

@@ -53,7 +53,7 @@ def test_keyframe_and_iteration_transfer_only_what_changed(
     def iteration() -> tuple[Transfers, int]:
         backend.render(view, is_half=False)
         backend.estimate_exposure()
-        _, visible = backend.descend(Exposure(), rate=1.0)
+        _, visible = backend.descend(Exposure(), rate=lambda _: 1.0)
         return arrays.taken(), len(visible.indices)
 
     backend.begin(gaussians)
