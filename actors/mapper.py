@@ -354,9 +354,9 @@ class Mapper(Actor):
         `MapperConfig.checkpoint_interval`.
         """
         newest = self._newest[1]
-        saved = self._checkpoint["newest"][1] if self._checkpoint else -UNLIMITED
-        is_due = newest - saved >= self.config.checkpoint_interval(len(self._map.gaussians))
-        if newest >= 0 and is_due:
+        saved = self._checkpoint["newest"][1] if self._checkpoint else None
+        interval = self.config.checkpoint_interval(len(self._map.gaussians))
+        if newest >= 0 and (saved is None or newest - saved >= interval):
             self._take_checkpoint()
         return {"map": self._checkpoint} if self._checkpoint else {}
 
