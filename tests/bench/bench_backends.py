@@ -172,7 +172,7 @@ def run_service(
             stderr=(folder / "log").open("wb"),
         )  # fmt: skip
         stack.callback(lambda: (process.send_signal(signal.SIGINT), process.wait(120)))
-        client = connect_patiently(stack, network)
+        client = connect_patiently(stack, network, process, folder / "log")
         session = stack.enter_context(open_session(network))
         monitor = Monitor(session, network)
         assert client.wait_for_subscriber(60)
@@ -207,11 +207,15 @@ def run_service(
     return result
 
 
-def connect_patiently(stack: ExitStack, network: Endpoint) -> Client:
+def connect_patiently(
+    stack: ExitStack, network: Endpoint, process: subprocess.Popen[bytes], log: Path
+) -> Client:
     for _ in range(120):
         try:
             return stack.enter_context(connect(network.robot, network.endpoint))
         except ConfigError:  # The router of the service is not open yet.
+            if process.poll() is not None:
+                raise SystemExit(log.read_text()[-3000:]) from None
             time.sleep(0.5)
     raise SystemExit(f"the service at {network.endpoint} did not answer")
 
