@@ -100,7 +100,7 @@ def live(
             stderr=log,
         )
         stack.callback(service.kill)
-        client = connect_patiently(stack, network)
+        client = connect_patiently(stack, network, service, Path(log.name))
         session = stack.enter_context(open_session(network))
         monitor, observer = Monitor(session, network), Observer(session, network, writer)
         assert client.wait_for_subscriber(60)
