@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ldo_service.calibration.correction import CameraCorrection
 from ldo_service.geometry import Camera, RgbdFrame
 
 from .change_log import ChangeLog, Changes, PublishedPoses
@@ -84,10 +85,12 @@ class MapBuilder:
         keyframe: int,
         iterations: int,
         dynamic_mask: np.ndarray | None = None,
+        correction: CameraCorrection | None = None,
     ) -> None:
         """Add a new keyframe to the map, and fit the map to it and to some older keyframes.
 
-        Where the map lacks surface, new Gaussians are added and anchored to the keyframe.
+        Where the map lacks surface, new Gaussians are added and anchored to the keyframe. If the
+        correction of the camera has changed, the images of older keyframes are converted to it.
 
         Args:
             frame: Color and depth of the keyframe.
@@ -96,7 +99,9 @@ class MapBuilder:
             iterations: Limit of the computing time; see `effort` in `GaussianOptimizer.optimize`.
                 Most iterations run at half resolution.
             dynamic_mask: Pixels of moving objects, which are not mapped, [H, W] bool; None if none.
+            correction: Correction of the camera that was applied to the frame; None if none.
         """
+        self.views.convert_to(correction or CameraCorrection())
         horizon = MaxDepthGrid.of(frame.depth_m)
         self._load_visible(PlacedCamera(frame.camera, T_map_camera, horizon))
         self._renderer.forget()
@@ -186,7 +191,7 @@ class MapBuilder:
         """
         self._load_visible(self.views.placed(keyframe))
         self._renderer.forget()
-        self.views.mask_pixels(keyframe, pixels)
+        self.views.store.mask_pixels(keyframe, pixels)
         theirs = np.flatnonzero(self.gaussians.anchors == keyframe)
         camera, T_map_camera = self.views.cameras[keyframe], self.views.poses[keyframe]
         is_there = visible_in_mask(pixels, self.gaussians.means[theirs], camera, T_map_camera)
