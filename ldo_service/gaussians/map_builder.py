@@ -25,7 +25,7 @@ from .offloading import OffloadedGaussians, iter_all_gaussians
 from .plan_attempt import Observer
 from .pruning import find_duplicates, prunable_mask
 from .renderer import Contributions, Rendering, RenderMemory
-from .training_views import TrainingView, visible_in_mask
+from .training_views import TrainingView, ignored_pixels, visible_in_mask
 from .visibility import BoundingSpheres, MaxDepthGrid, PlacedCamera, chunk_numbers, plan_offload
 
 # Maximum iterations per unit of effort: (0.8 / 0.38 + 0.2) * 2 if almost no Gaussian is visible.
@@ -91,6 +91,7 @@ class MapBuilder:
 
         Where the map lacks surface, new Gaussians are added and anchored to the keyframe. If the
         correction of the camera has changed, the images of older keyframes are converted to it.
+        The black rim that rectification leaves is not mapped.
 
         Args:
             frame: Color and depth of the keyframe.
@@ -106,10 +107,10 @@ class MapBuilder:
         self._load_visible(PlacedCamera(frame.camera, T_map_camera, horizon))
         self._renderer.forget()
         before = self.render_from(frame.camera, T_map_camera)
-        counts = None if dynamic_mask is None else (~dynamic_mask).astype(np.uint8)
-        view = replace(TrainingView.of(frame, T_map_camera, keyframe), mask=counts)
+        ignored = ignored_pixels(frame, dynamic_mask)
+        view = TrainingView.of(frame, T_map_camera, keyframe, ignored)
         view = replace(view, exposure=self._exposure(view, before))
-        self._insert(frame, T_map_camera, keyframe, before, view.exposure, dynamic_mask)
+        self._insert(frame, view, before)
         self._published.add(keyframe, T_map_camera)
         self._newest = keyframe
         for forgotten in self.views.add(view, horizon):
@@ -154,23 +155,15 @@ class MapBuilder:
             return estimated or Exposure()
         return self.views.exposures[self._newest]
 
-    def _insert(
-        self,
-        frame: RgbdFrame,
-        T_map_camera: np.ndarray,
-        keyframe: int,
-        before: Rendering,
-        exposure: Exposure,
-        dynamic_mask: np.ndarray | None,
-    ) -> None:
+    def _insert(self, frame: RgbdFrame, view: TrainingView, before: Rendering) -> None:
         densify(
             self.gaussians,
-            replace(frame, color=exposure.removed_from_image(frame.color)),
-            T_map_camera,
-            keyframe,
+            replace(frame, color=view.exposure.removed_from_image(frame.color)),
+            view.T_map_camera,
+            view.keyframe,
             self.config.insertion,
             before=before,
-            ignore_mask=dynamic_mask,
+            ignore_mask=None if view.mask is None else view.mask == 0,
             memory=self._insertion_memory,
             threads=self._threads,
         )

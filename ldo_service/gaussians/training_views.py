@@ -15,6 +15,7 @@ import zstandard
 from ldo_service.calibration.correction import CameraCorrection, CorrectionChange
 from ldo_service.errors import DataError
 from ldo_service.geometry import Camera, RgbdFrame, se3
+from ldo_service.geometry.frames import pixels_without_data
 from ldo_service.kernels import _align
 
 from .exposure import Exposure
@@ -50,10 +51,24 @@ class TrainingView:
     mask: np.ndarray | None = None
 
     @classmethod
-    def of(cls, frame: RgbdFrame, T_map_camera: np.ndarray, keyframe: int) -> "TrainingView":
-        """Return the training view of a frame, with gain 1, bias 0 and without a mask."""
+    def of(
+        cls,
+        frame: RgbdFrame,
+        T_map_camera: np.ndarray,
+        keyframe: int,
+        ignored: np.ndarray | None = None,
+    ) -> "TrainingView":
+        """Return the training view of a frame, with gain 1 and bias 0.
+
+        Args:
+            frame: Color and depth.
+            T_map_camera: Pose, [4, 4].
+            keyframe: Id of the keyframe.
+            ignored: Pixels that are not used, [H, W] bool; None to use all.
+        """
         planes = np.ascontiguousarray(frame.color.transpose(2, 0, 1))
-        return cls(keyframe, frame.camera, planes, frame.depth_m, T_map_camera)
+        mask = None if ignored is None else (~ignored).astype(np.uint8)
+        return cls(keyframe, frame.camera, planes, frame.depth_m, T_map_camera, mask=mask)
 
     def halved(self) -> "TrainingView":
         """Return the view at half resolution; each pixel averages a block of 2x2 pixels.
@@ -74,6 +89,17 @@ class TrainingView:
             mask = np.minimum(both[:, ::2], both[:, 1::2])
         depth_m = _align.halve(np.ascontiguousarray(self.depth_m), ANY_DIFFERENCE, 4)
         return replace(self, camera=camera, color=color, depth_m=depth_m, mask=mask)
+
+
+def ignored_pixels(frame: RgbdFrame, dynamic_mask: np.ndarray | None) -> np.ndarray | None:
+    """Return which pixels of a keyframe are not mapped, [H, W] bool; None if all are.
+
+    These are the pixels of moving objects, and those for which the camera delivered no data.
+    """
+    mask = pixels_without_data(frame)
+    if dynamic_mask is not None:
+        mask |= dynamic_mask
+    return mask if mask.any() else None
 
 
 def sampled_surface(view: TrainingView, *, step_px: int = 32) -> np.ndarray:
@@ -203,7 +229,7 @@ class KeyframeImages:
             )
 
     @classmethod
-    def of(cls, view: TrainingView, correction: CameraCorrection) -> "KeyframeImages":
+    def of(cls, view: TrainingView, correction: CameraCorrection | None = None) -> "KeyframeImages":
         """Return the images of a training view, to which a correction was applied."""
         return cls(view.keyframe, view.camera, view.color, view.depth_m, view.mask, correction)
 

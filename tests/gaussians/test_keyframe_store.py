@@ -92,7 +92,7 @@ def test_invalid_bytes_raise(body: bytes) -> None:
 def test_view_combines_images_with_pose_and_exposure() -> None:
     images, T = images_of(5, mask=True), np.diag([1.0, -1, -1, 1])
     view = images.view(T, Exposure(np.full(3, 2, np.float32)))
-    assert_same(KeyframeImages.of(view, CameraCorrection()), images)
+    assert_same(KeyframeImages.of(view), images)
     assert view.T_map_camera is T
     np.testing.assert_array_equal(view.exposure.gain, 2)
 

@@ -144,6 +144,33 @@ def test_late_estimate_of_the_vignetting_corrects_the_map_and_its_keyframes(
     assert restored.views.store.correction == vignetting
 
 
+def test_black_rim_of_rectification_is_not_mapped(posed_frames: dict) -> None:
+    """A keyframe whose rim is black must not darken the surface that other keyframes see."""
+    rim = np.ones((*posed_frames[0][0].depth_m.shape, 1), bool)
+    rim[12:-12, 12:-12] = False
+    cut = {
+        i: (
+            replace(frame, color=frame.color * ~rim, depth_m=frame.depth_m * ~rim[..., 0])
+            if i != KEYFRAMES[0]
+            else frame,
+            T,
+        )
+        for i, (frame, T) in posed_frames.items()
+    }
+    builder = build_map(cut, iterations=10)
+    mask = builder.views[1].mask
+    assert mask is not None
+    assert (mask == 0)[:13].all()
+    assert (mask > 0)[13:-13, 13:-13].all()
+    assert builder.views[0].mask is None
+    frame, T_map_camera = posed_frames[KEYFRAMES[0]]
+    rendered = render(builder.gaussians.rows, frame.camera, se3.inverse(T_map_camera)).color
+    whole = build_map(posed_frames, iterations=10)
+    expected = render(whole.gaussians.rows, frame.camera, se3.inverse(T_map_camera)).color
+    seen = frame.color / np.float32(255)
+    assert psnr(rendered.clip(0, 1), seen) > psnr(expected.clip(0, 1), seen) - 1
+
+
 def test_keyframes_damaged_on_disk_are_skipped(posed_frames: dict, tmp_path: Path) -> None:
     builder = MapBuilder(folder=tmp_path)
     builder.views.store.config = replace(builder.views.store.config, cache_mb=0)
