@@ -23,7 +23,11 @@ from typing import Any
 import numpy as np
 
 from ldo_service.actors.mapper_config import MapperConfig
-from ldo_service.conversions.frames import frame_from_message, mask_from_array
+from ldo_service.conversions.frames import (
+    camera_correction_from_message,
+    frame_from_message,
+    mask_from_array,
+)
 from ldo_service.conversions.objects import detections_from_message, observations_to_messages
 from ldo_service.conversions.poses import (
     keyframe_poses_from_correction,
@@ -74,9 +78,8 @@ from ldo_service.semantics.ordered_semantics import OrderedSemantics
 
 # Idle steps between two messages with changed Gaussians: some seconds of work, up to 4 MB.
 IDLE_STEPS_PER_DELTA = 8
-# Time without messages after which the camera stands still, seconds. Late labels are then
-# corrected with the finished map of all keyframes; in shorter pauses, the result would depend on
-# the pauses.
+# Time without messages after which the camera stands still and late labels are corrected, seconds.
+# The result would depend on shorter pauses.
 STILL_AFTER_S = 5.0
 
 MapOutput = MapRendering | MapDelta | MapSnapshot | MapObjects
@@ -163,7 +166,8 @@ class Mapper(Actor):
         self._newest = (message.stamp_ns, message.keyframe)
         frame = frame_from_message(message)
         moving = mask_from_array(message.dynamic_mask)
-        self._map.add(frame, T_map_keyframe, message.keyframe, self._iterations(), moving)
+        used = camera_correction_from_message(message.camera_correction)
+        self._map.add(frame, T_map_keyframe, message.keyframe, self._iterations(), moving, used)
         fused = self._ordered.on_keyframe_mapped(message.keyframe)
         self._refit.with_keyframe(is_behind=self._waiting() > 0)
         yield from self._refinement()
@@ -177,9 +181,8 @@ class Mapper(Actor):
     def _iterations(self) -> int:
         """Return the number of optimization iterations for the next keyframe.
 
-        The more keyframes wait, the fewer iterations each one gets. The Gaussians of a keyframe are
-        optimized again with later keyframes, which use it as a neighboring view. The iterations of
-        a pending deduplication are subtracted.
+        The more keyframes wait, the fewer iterations each one gets. Its Gaussians are optimized
+        again with later keyframes. The iterations of a pending deduplication are subtracted.
         """
         return max(
             self.config.iterations // (1 + self._waiting()) - self._refit.deduplication_iterations,
@@ -284,10 +287,7 @@ class Mapper(Actor):
         return MessageContext(self._newest[0], self._poses.version, self._semantics.names)
 
     def on_restored(self) -> Iterator[Output]:
-        """Publish the whole map.
-
-        Subscribers may have missed deltas, and new subscribers need the whole map.
-        """
+        """Publish the whole map, because subscribers may have missed deltas."""
         if self._map.size():
             yield from self._publisher.publish_snapshot(self._message_context())
             yield from self._objects()

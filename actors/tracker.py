@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.calibration.correction import CameraCorrection, read_corrections
+from ldo_service.calibration.correction import CameraCorrection, read_correction
 from ldo_service.calibration.self_calibration import SelfCalibration, SelfCalibrationConfig
 from ldo_service.conversions.frames import (
     frame_from_message,
@@ -372,7 +372,7 @@ def _known_correction(config: TrackerConfig) -> CameraCorrection:
     if not folder:
         return CameraCorrection()
     try:
-        return read_corrections(Path(folder)).last
+        return read_correction(Path(folder))
     except DataError as error:
         if config.localize:
             raise

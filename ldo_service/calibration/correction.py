@@ -1,7 +1,6 @@
 """Correction of vignetting and depth bias in frames."""
 
 import json
-from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -73,6 +72,11 @@ class CameraCorrection:
         }
 
     @property
+    def of_images(self) -> "CameraCorrection":
+        """The correction without the times of the shutter: what `applied` depends on."""
+        return replace(self, timing=ShutterTiming())
+
+    @property
     def has_depth_bias(self) -> bool:
         return any(self.depth_bias)
 
@@ -117,46 +121,20 @@ class CameraCorrection:
         return _bias_image(self.depth_bias, camera)
 
 
-@dataclass(frozen=True, slots=True)
-class CorrectionHistory:
-    """Camera corrections with which the keyframes of a run were made, in order of time."""
+def read_correction(folder: Path) -> CameraCorrection:
+    """Return the camera correction with which the last keyframe of a finished run was made.
 
-    stamps_ns: tuple[int, ...] = ()  # Stamps of the keyframes.
-    corrections: tuple[CameraCorrection, ...] = ()  # Corrections, one per keyframe.
-
-    def at(self, stamp_ns: int) -> CameraCorrection:
-        """Return the correction of the last keyframe whose stamp is at most `stamp_ns`.
-
-        If there is no such keyframe, the result is a correction that changes nothing.
-        """
-        count = bisect_right(self.stamps_ns, stamp_ns)
-        return self.corrections[count - 1] if count else CameraCorrection()
-
-    @property
-    def last(self) -> CameraCorrection:
-        """Correction of the last keyframe; it changes nothing if there is no keyframe."""
-        return self.corrections[-1] if self.corrections else CameraCorrection()
-
-
-def read_corrections(folder: Path) -> CorrectionHistory:
-    """Return the camera correction with which each keyframe of a finished run was made.
-
-    Older versions of LDO-SLAM did not write corrections. For their keyframes, the result has a
-    correction that changes nothing.
+    The map converts the images of earlier keyframes to this correction. If there is no keyframe, or
+    if an older version of LDO-SLAM wrote the run, the result changes nothing.
 
     Raises:
         DataError: keyframes.json of the folder cannot be read, or its content is invalid.
     """
     path = folder / "keyframes.json"
     try:
-        keyframes = sorted(json.loads(path.read_text()), key=lambda keyframe: keyframe["stamp_ns"])
-        return CorrectionHistory(
-            tuple(int(keyframe["stamp_ns"]) for keyframe in keyframes),
-            tuple(
-                CameraCorrection.of(keyframe.get("camera_correction", NO_CORRECTION))
-                for keyframe in keyframes
-            ),
-        )
+        keyframes = json.loads(path.read_text())
+        last = max(keyframes, key=lambda keyframe: int(keyframe["stamp_ns"]), default={})
+        return CameraCorrection.of(last.get("camera_correction", NO_CORRECTION))
     except OSError as error:
         raise DataError(
             f"{path} cannot be read: {error.strerror}. Give the folder of a finished `ldo run`."
@@ -198,6 +176,22 @@ class CorrectionChange:
         if self.old.depth_bias == self.new.depth_bias:
             return depth_m
         return unbiased_depth(depth_m, self.new.bias(camera) - self.old.bias(camera))
+
+    def color(self, planes: np.ndarray, camera: Camera) -> np.ndarray:
+        """Convert color [3, H, W] uint8 from the old correction to the new one."""
+        if self.old.vignetting == self.new.vignetting:
+            return planes
+        gain = (self.new.gain(camera) / self.old.gain(camera)).transpose(2, 0, 1)
+        return np.clip(planes * gain + np.float32(0.5), 0, 255).astype(np.uint8)
+
+    def brightness(self, camera: Camera) -> np.ndarray:
+        """Return the factor, [3] float32, by which the colors at the center of the image change.
+
+        `CameraCorrection.applied` darkens the center to the level of the strongest vignetting. The
+        exposure of a converted image changes by this factor.
+        """
+        at = camera.height // 2, camera.width // 2
+        return self.new.gain(camera)[at] / self.old.gain(camera)[at]
 
     def gray(self, gray: np.ndarray, camera: Camera) -> np.ndarray:
         """Convert a gray image [H, W] uint8 from the old correction to the new one.

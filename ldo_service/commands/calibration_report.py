@@ -11,7 +11,7 @@ from ldo_service.calibration.correction import (
     BIAS_TERMS,
     CameraCorrection,
     bias_basis,
-    read_corrections,
+    read_correction,
     unbiased_depth,
 )
 from ldo_service.calibration.outlines import NAMES, SHIFT_DEPTH_M, SIGMA_NAMES
@@ -72,7 +72,7 @@ def camera_findings(folder: Path) -> Iterator[Finding]:
     viewpoints = list(read_viewpoints(folder).values())
     if not viewpoints:
         raise DataError(f"{folder} has no keyframes. Give the folder of a run with a map.")
-    correction, camera = read_corrections(folder).last, viewpoints[-1].camera
+    correction, camera = read_correction(folder), viewpoints[-1].camera
     metrics = _metrics(folder)
     yield _progress(metrics, is_on=tracker.self_calibration, known=tracker.calibration_run)
     yield _depth_bias(correction, camera, metrics)

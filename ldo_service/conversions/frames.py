@@ -150,6 +150,11 @@ def camera_correction_to_message(correction: CameraCorrection) -> schemas.Camera
     return msgspec.convert(correction.pack(), schemas.CameraCorrection)
 
 
+def camera_correction_from_message(message: schemas.CameraCorrection) -> CameraCorrection:
+    """Return the correction of the camera of a message."""
+    return CameraCorrection.of(msgspec.to_builtins(message))
+
+
 def keyframe_measurements_message(keyframe: Keyframe) -> KeyframeMeasurements:
     """Return the message with the measurements of a keyframe, without its images."""
     fields = KeyframeMeasurements.__struct_fields__

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ldo_service.calibration.correction import CorrectionHistory
+from ldo_service.calibration.correction import CameraCorrection
 from ldo_service.calibration.shutter import FrameMotion
 from ldo_service.errors import DataError
 from ldo_service.gaussians.exposure import Exposure
@@ -96,8 +96,8 @@ class PosedMap:
         trajectory: Poses T_map_camera of the frames that are not LOST.
         exposures: Exposures of the keyframes.
         semantics: Labels of the Gaussians; None without a detector.
-        corrections: Corrections of vignetting, depth bias and rolling shutter of the camera, as
-            applied to the keyframes.
+        correction: Correction of vignetting, depth bias and rolling shutter of the camera, to which
+            the map has converted its keyframes.
         objects: Objects of the map; None without a detector.
     """
 
@@ -106,7 +106,7 @@ class PosedMap:
     trajectory: Trajectory
     exposures: Exposures
     semantics: SavedSemantics | None = None
-    corrections: CorrectionHistory = field(default_factory=CorrectionHistory)
+    correction: CameraCorrection = field(default_factory=CameraCorrection)
     objects: SavedObjects | None = None
 
     def T_map_camera(self, frame: RunFrame) -> np.ndarray:
@@ -130,7 +130,7 @@ class PosedMap:
             The motion. None if one of the two neighboring frames is missing, if they are more than
             0.3 s apart, if the motion is implausible, or if no shutter timing is known.
         """
-        timing = self.corrections.at(frame.stamp_ns).timing
+        timing = self.correction.timing
         stamps_s = self.trajectory.stamps_s
         if not timing or len(stamps_s) < 3:
             return None

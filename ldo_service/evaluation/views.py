@@ -153,7 +153,7 @@ class RenderedView:
     exposure: Exposure = field(default_factory=Exposure)
     # Pixels that show the camera image, not the rim of rectification, [H, W] bool; None for all.
     valid: np.ndarray | None = None
-    # Correction of the camera at the time of the frame; `recorded` applies its vignetting.
+    # Correction of the camera; `recorded` applies its vignetting.
     correction: CameraCorrection = field(default_factory=CameraCorrection)
     # Motion of the camera during the frame, for the rolling shutter; None if unknown.
     motion: FrameMotion | None = None
@@ -319,7 +319,7 @@ def view_of(
     """
     T_camera_map = se3.inverse(posed.T_map_camera(frame))
     rendering = render(posed.rows, image.camera, T_camera_map, threads=threads)
-    correction = posed.corrections.at(frame.stamp_ns)
+    correction = posed.correction
     depth_m = correction.corrected_depth(image.depth_m, image.camera)
     motion = posed.motion(frame)
     if motion is not None:

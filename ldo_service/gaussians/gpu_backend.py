@@ -34,6 +34,7 @@ class ResidentFrame:
 
     Attributes:
         color: Weak reference to the color image of the view in host memory.
+        depth_m: Weak reference to the depth image of the view in host memory.
         mask: Weak reference to the mask of the view in host memory; None if it has no mask.
         image: Color, depth and mask in GPU memory.
         size: Width and height of the copy, pixels.
@@ -42,6 +43,7 @@ class ResidentFrame:
     """
 
     color: ref[np.ndarray]
+    depth_m: ref[np.ndarray]
     mask: ref[np.ndarray] | None
     image: frame_loss.Frame
     size: tuple[int, int]
@@ -51,8 +53,10 @@ class ResidentFrame:
     def shows(self, view: TrainingView) -> bool:
         """Return whether these are the images of `view`."""
         mask = self.mask and self.mask()
-        return self.color() is view.color and (
-            view.mask is None if self.mask is None else mask is view.mask
+        return (
+            self.color() is view.color
+            and self.depth_m() is view.depth_m
+            and (view.mask is None if self.mask is None else mask is view.mask)
         )
 
 
@@ -196,6 +200,7 @@ class GpuBackend:
         camera = image.camera
         return ResidentFrame(
             ref(view.color),
+            ref(view.depth_m),
             None if view.mask is None else ref(view.mask),
             frame_loss.Frame(color, depth_m, mask, measured),
             (camera.width, camera.height),

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ldo_service.calibration.correction import CameraCorrection, CorrectionChange
 from ldo_service.errors import ConfigError, DataError, named
 from ldo_service.geometry import Camera
 from ldo_service.geometry.point_records import PoseTable
@@ -61,6 +62,8 @@ class KeyframeStore:
 
     Attributes:
         files: The folder of the images.
+        correction: Correction of the camera to which `get` converts images. The files keep the
+            images of `put`. None until the first `convert_to`: `get` then converts nothing.
 
     Raises:
         ConfigError: The folder cannot be used.
@@ -69,6 +72,7 @@ class KeyframeStore:
     def __init__(self, folder: Path | None, config: KeyframeStoreConfig | None = None) -> None:
         self.config = config or KeyframeStoreConfig()
         self.files = ChecksummedFolder(folder, "keyframe", _DISK_FULL)
+        self.correction: CameraCorrection | None = None
         self._cache: OrderedDict[int, KeyframeImages] = OrderedDict()  # Least recently used first.
         self._reads = self._forgotten = self._damaged = 0
         self._make_room()
@@ -76,18 +80,43 @@ class KeyframeStore:
     def put(self, images: KeyframeImages) -> None:
         """Store copies of the images of a keyframe; images stored earlier for it are replaced."""
         images = images.owned()
-        self._remember(images)
+        self._remember(self._converted(images))
         self.files.write(images.keyframe, pack(images))
         self._make_room()
 
     def get(self, keyframe: int) -> KeyframeImages | None:
-        """Return the images of a keyframe, read-only and bitwise unchanged; None if unavailable."""
+        """Return the images of a keyframe, read-only and in `correction`; None if unavailable."""
         images = self._cache.get(keyframe)
         if images is not None:
             self._cache.move_to_end(keyframe)
-        elif keyframe in self.files.sizes:
-            images = self._read(keyframe)
+            return images
+        images = self._read(keyframe)
+        if images is not None:
+            images = self._converted(images)
+            self._remember(images)
         return images
+
+    def convert_to(self, correction: CameraCorrection | None) -> None:
+        """Convert the images of later `get` calls from their own correction to this one."""
+        self.correction = correction
+        for keyframe in [k for k in self._cache if k in self.files.sizes]:
+            del self._cache[keyframe]
+        self._cache = OrderedDict((k, self._converted(i)) for k, i in self._cache.items())
+
+    def _converted(self, images: KeyframeImages) -> KeyframeImages:
+        return images if self.correction is None else images.recorrected(self.correction)
+
+    def mask_pixels(self, keyframe: int, pixels: np.ndarray) -> None:
+        """Exclude pixels [H, W] bool of a keyframe from fitting.
+
+        Raises:
+            KeyError: The images of the keyframe are dropped or unreadable.
+        """
+        images = self._read(keyframe) or self._cache.get(keyframe)
+        if images is None:
+            raise KeyError(keyframe)
+        counts = ~pixels if images.mask is None else ~pixels & (images.mask > 0)
+        self.put(replace(images, mask=counts.astype(np.uint8)))
 
     def __contains__(self, keyframe: int) -> bool:
         return keyframe in self.files.sizes or keyframe in self._cache
@@ -132,6 +161,9 @@ class KeyframeStore:
 
     # --- disk -------------------------------------------------------------------------------------
     def _read(self, keyframe: int) -> KeyframeImages | None:
+        """Return the images of a keyframe as they were stored; None if no valid file has them."""
+        if keyframe not in self.files.sizes:
+            return None
         self._reads += 1
         try:
             images = unpack(self.files.read(keyframe))
@@ -149,7 +181,6 @@ class KeyframeStore:
             self._damaged += 1
             self._drop(keyframe)
             return None
-        self._remember(images)
         return images
 
     def _drop(self, keyframe: int) -> None:
@@ -218,7 +249,7 @@ class KeyframeViews:
         """
         if not self.poses:
             self.store.keep_only(())  # Drop images of an earlier run in the folder.
-        self.store.put(KeyframeImages.of(view))
+        self.store.put(KeyframeImages.of(view, self.store.correction or CameraCorrection()))
         self[view.keyframe] = view
         self.horizons[view.keyframe] = horizon
         return self._forgotten(view.keyframe)
@@ -232,17 +263,28 @@ class KeyframeViews:
                 del table[keyframe]
         return gone
 
-    def mask_pixels(self, keyframe: int, pixels: np.ndarray) -> None:
-        """Exclude pixels [H, W] bool of a keyframe from fitting.
+    def convert_to(self, correction: CameraCorrection) -> bool:
+        """Convert all keyframes to a correction of the camera, for images that arrive with it.
 
-        Raises:
-            KeyError: The images of the keyframe are dropped or unreadable.
+        The horizons stay, because the Gaussians of these keyframes stay where they were added.
+
+        Args:
+            correction: The correction; the times of the shutter do not matter.
+
+        Returns:
+            Whether the images of earlier keyframes change.
         """
-        images = self.store.get(keyframe)
-        if images is None:
-            raise KeyError(keyframe)
-        counts = ~pixels if images.mask is None else ~pixels & (images.mask > 0)
-        self.store.put(replace(images, mask=counts.astype(np.uint8)))
+        before, now = self.store.correction, correction.of_images
+        if before == now:
+            return False
+        self.store.convert_to(now)
+        if before is None or not self.exposures:
+            return False
+        change = CorrectionChange(before, now)
+        for keyframe, exposure in self.exposures.items():
+            factor = change.brightness(self.cameras[keyframe])
+            self.exposures[keyframe] = Exposure(factor * exposure.gain, factor * exposure.bias)
+        return True
 
     def placed(self, keyframe: int) -> PlacedCamera:
         """Return the camera and pose of a keyframe, with the largest depth in each image block.
@@ -290,6 +332,7 @@ class KeyframeViews:
             "T_map_camera": self.poses.of(self.poses),
             "exposures": np.array(exposures, np.float32).reshape(-1, 2, 3),
             "horizons": np.array(horizons, np.float32).reshape(-1, *BLOCKS),
+            "correction": self.store.correction and self.store.correction.pack(),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -300,3 +343,5 @@ class KeyframeViews:
         self.exposures = dict(zip(keyframes, map(Exposure.of, state["exposures"]), strict=True))
         self.horizons = dict(zip(keyframes, map(MaxDepthGrid, state["horizons"]), strict=True))
         self.store.keep_only(keyframes)
+        correction = state.get("correction")  # Older versions of LDO-SLAM did not save it.
+        self.store.convert_to(correction and CameraCorrection.of(correction))

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ldo_service.calibration.correction import CameraCorrection
 from ldo_service.geometry import Camera, RgbdFrame
 
 from .change_log import ChangeLog, Changes, PublishedPoses
@@ -24,7 +25,7 @@ from .offloading import OffloadedGaussians, iter_all_gaussians
 from .plan_attempt import Observer
 from .pruning import find_duplicates, prunable_mask
 from .renderer import Contributions, Rendering, RenderMemory
-from .training_views import TrainingView, visible_in_mask
+from .training_views import TrainingView, ignored_pixels, visible_in_mask
 from .visibility import BoundingSpheres, MaxDepthGrid, PlacedCamera, chunk_numbers, plan_offload
 
 # Maximum iterations per unit of effort: (0.8 / 0.38 + 0.2) * 2 if almost no Gaussian is visible.
@@ -84,10 +85,13 @@ class MapBuilder:
         keyframe: int,
         iterations: int,
         dynamic_mask: np.ndarray | None = None,
+        correction: CameraCorrection | None = None,
     ) -> None:
         """Add a new keyframe to the map, and fit the map to it and to some older keyframes.
 
-        Where the map lacks surface, new Gaussians are added and anchored to the keyframe.
+        Where the map lacks surface, new Gaussians are added and anchored to the keyframe. If the
+        correction of the camera has changed, the images of older keyframes are converted to it.
+        The black rim that rectification leaves is not mapped.
 
         Args:
             frame: Color and depth of the keyframe.
@@ -96,15 +100,17 @@ class MapBuilder:
             iterations: Limit of the computing time; see `effort` in `GaussianOptimizer.optimize`.
                 Most iterations run at half resolution.
             dynamic_mask: Pixels of moving objects, which are not mapped, [H, W] bool; None if none.
+            correction: Correction of the camera that was applied to the frame; None if none.
         """
+        self.views.convert_to(correction or CameraCorrection())
         horizon = MaxDepthGrid.of(frame.depth_m)
         self._load_visible(PlacedCamera(frame.camera, T_map_camera, horizon))
         self._renderer.forget()
         before = self.render_from(frame.camera, T_map_camera)
-        counts = None if dynamic_mask is None else (~dynamic_mask).astype(np.uint8)
-        view = replace(TrainingView.of(frame, T_map_camera, keyframe), mask=counts)
+        ignored = ignored_pixels(frame, dynamic_mask)
+        view = TrainingView.of(frame, T_map_camera, keyframe, ignored)
         view = replace(view, exposure=self._exposure(view, before))
-        self._insert(frame, T_map_camera, keyframe, before, view.exposure, dynamic_mask)
+        self._insert(frame, view, before)
         self._published.add(keyframe, T_map_camera)
         self._newest = keyframe
         for forgotten in self.views.add(view, horizon):
@@ -149,23 +155,15 @@ class MapBuilder:
             return estimated or Exposure()
         return self.views.exposures[self._newest]
 
-    def _insert(
-        self,
-        frame: RgbdFrame,
-        T_map_camera: np.ndarray,
-        keyframe: int,
-        before: Rendering,
-        exposure: Exposure,
-        dynamic_mask: np.ndarray | None,
-    ) -> None:
+    def _insert(self, frame: RgbdFrame, view: TrainingView, before: Rendering) -> None:
         densify(
             self.gaussians,
-            replace(frame, color=exposure.removed_from_image(frame.color)),
-            T_map_camera,
-            keyframe,
+            replace(frame, color=view.exposure.removed_from_image(frame.color)),
+            view.T_map_camera,
+            view.keyframe,
             self.config.insertion,
             before=before,
-            ignore_mask=dynamic_mask,
+            ignore_mask=None if view.mask is None else view.mask == 0,
             memory=self._insertion_memory,
             threads=self._threads,
         )
@@ -186,7 +184,7 @@ class MapBuilder:
         """
         self._load_visible(self.views.placed(keyframe))
         self._renderer.forget()
-        self.views.mask_pixels(keyframe, pixels)
+        self.views.store.mask_pixels(keyframe, pixels)
         theirs = np.flatnonzero(self.gaussians.anchors == keyframe)
         camera, T_map_camera = self.views.cameras[keyframe], self.views.poses[keyframe]
         is_there = visible_in_mask(pixels, self.gaussians.means[theirs], camera, T_map_camera)

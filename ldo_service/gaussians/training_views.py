@@ -1,6 +1,7 @@
 """Training views (keyframes that the map is optimized against) and their random choice.
 
-The images of a training view never change and are stored as compressed bytes.
+The images of a training view are stored as compressed bytes. If the estimate of the camera's
+vignetting or depth bias changes later, the images are converted when they are read.
 """
 
 from collections.abc import Sequence
@@ -11,8 +12,10 @@ import msgspec
 import numpy as np
 import zstandard
 
+from ldo_service.calibration.correction import CameraCorrection, CorrectionChange
 from ldo_service.errors import DataError
 from ldo_service.geometry import Camera, RgbdFrame, se3
+from ldo_service.geometry.frames import pixels_without_data
 from ldo_service.kernels import _align
 
 from .exposure import Exposure
@@ -48,10 +51,24 @@ class TrainingView:
     mask: np.ndarray | None = None
 
     @classmethod
-    def of(cls, frame: RgbdFrame, T_map_camera: np.ndarray, keyframe: int) -> "TrainingView":
-        """Return the training view of a frame, with gain 1, bias 0 and without a mask."""
+    def of(
+        cls,
+        frame: RgbdFrame,
+        T_map_camera: np.ndarray,
+        keyframe: int,
+        ignored: np.ndarray | None = None,
+    ) -> "TrainingView":
+        """Return the training view of a frame, with gain 1 and bias 0.
+
+        Args:
+            frame: Color and depth.
+            T_map_camera: Pose, [4, 4].
+            keyframe: Id of the keyframe.
+            ignored: Pixels that are not used, [H, W] bool; None to use all.
+        """
         planes = np.ascontiguousarray(frame.color.transpose(2, 0, 1))
-        return cls(keyframe, frame.camera, planes, frame.depth_m, T_map_camera)
+        mask = None if ignored is None else (~ignored).astype(np.uint8)
+        return cls(keyframe, frame.camera, planes, frame.depth_m, T_map_camera, mask=mask)
 
     def halved(self) -> "TrainingView":
         """Return the view at half resolution; each pixel averages a block of 2x2 pixels.
@@ -72,6 +89,17 @@ class TrainingView:
             mask = np.minimum(both[:, ::2], both[:, 1::2])
         depth_m = _align.halve(np.ascontiguousarray(self.depth_m), ANY_DIFFERENCE, 4)
         return replace(self, camera=camera, color=color, depth_m=depth_m, mask=mask)
+
+
+def ignored_pixels(frame: RgbdFrame, dynamic_mask: np.ndarray | None) -> np.ndarray | None:
+    """Return which pixels of a keyframe are not mapped, [H, W] bool; None if all are.
+
+    These are the pixels of moving objects, and those for which the camera delivered no data.
+    """
+    mask = pixels_without_data(frame)
+    if dynamic_mask is not None:
+        mask |= dynamic_mask
+    return mask if mask.any() else None
 
 
 def sampled_surface(view: TrainingView, *, step_px: int = 32) -> np.ndarray:
@@ -164,7 +192,7 @@ def sample_training_views(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class KeyframeImages:
-    """Images and camera of a training view, which never change.
+    """Images and camera of a training view.
 
     Attributes:
         keyframe: Id of the keyframe.
@@ -172,6 +200,8 @@ class KeyframeImages:
         color: [3, H, W] uint8.
         depth_m: [H, W] float32, meters; 0 where not measured.
         mask: [H, W] uint8, 0 where the pixel is ignored; None to use all pixels.
+        correction: Correction of the camera that was applied to the images. None if unknown, in
+            images that an older version of LDO-SLAM stored.
 
     Raises:
         DataError: The images do not fit the camera.
@@ -182,6 +212,7 @@ class KeyframeImages:
     color: np.ndarray
     depth_m: np.ndarray
     mask: np.ndarray | None = None
+    correction: CameraCorrection | None = None
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)
@@ -198,9 +229,19 @@ class KeyframeImages:
             )
 
     @classmethod
-    def of(cls, view: TrainingView) -> "KeyframeImages":
-        """Return the images of a training view."""
-        return cls(view.keyframe, view.camera, view.color, view.depth_m, view.mask)
+    def of(cls, view: TrainingView, correction: CameraCorrection | None = None) -> "KeyframeImages":
+        """Return the images of a training view, to which a correction was applied."""
+        return cls(view.keyframe, view.camera, view.color, view.depth_m, view.mask, correction)
+
+    def recorrected(self, correction: CameraCorrection) -> "KeyframeImages":
+        """Convert the images to another correction; images of unknown correction stay unchanged."""
+        if self.correction is None or self.correction == correction:
+            return self
+        change = CorrectionChange(self.correction, correction)
+        color = change.color(self.color, self.camera)
+        depth_m = change.depth_m(self.depth_m, self.camera)
+        color.flags.writeable = depth_m.flags.writeable = False
+        return replace(self, color=color, depth_m=depth_m, correction=correction)
 
     def view(self, T_map_camera: np.ndarray, exposure: Exposure | None = None) -> TrainingView:
         """Return these images as a training view with a pose [4, 4] and an exposure.
@@ -246,6 +287,7 @@ class _Stored(msgspec.Struct, frozen=True):
     depth: bytes
     is_depth_differences: bool
     mask: bytes | None
+    correction: CameraCorrection | None = None
 
 
 def pack(images: KeyframeImages) -> bytes:
@@ -258,6 +300,7 @@ def pack(images: KeyframeImages) -> bytes:
         depth,
         is_differences,
         None if images.mask is None else _compressed(images.mask),
+        images.correction,
     )
     return msgspec.msgpack.encode(stored)
 
@@ -282,7 +325,7 @@ def unpack(body: bytes | memoryview) -> KeyframeImages:
     for image in (color, depth_m, mask):
         if image is not None:
             image.flags.writeable = False
-    return KeyframeImages(stored.keyframe, camera, color, depth_m, mask)
+    return KeyframeImages(stored.keyframe, camera, color, depth_m, mask, stored.correction)
 
 
 def _color_differences(color: np.ndarray) -> np.ndarray:

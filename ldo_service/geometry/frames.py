@@ -169,6 +169,24 @@ def valid_pixels(camera: Camera) -> np.ndarray | None:
     return (u >= 0) & (u <= camera.width - 1) & (v >= 0) & (v <= camera.height - 1)
 
 
+def pixels_without_data(frame: RgbdFrame) -> np.ndarray:
+    """Return the pixels at the border of a frame for which the camera delivered no data.
+
+    Rectification and the compensation of motion leave a rim of such pixels. They are black and have
+    no depth. The mask is one pixel wider, because interpolation darkens the pixels next to the rim.
+
+    Returns:
+        Mask [H, W] bool.
+    """
+    empty = (frame.depth_m == 0) & (brightest(frame.color) == 0)
+    count, parts = cv2.connectedComponents(empty.astype(np.uint8), connectivity=4)
+    is_rim = np.zeros(count, bool)
+    for side in (parts[0], parts[-1], parts[:, 0], parts[:, -1]):
+        is_rim[side] = True
+    is_rim[0] = False  # Number 0 are the pixels that have data.
+    return cv2.dilate(is_rim[parts].astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+
+
 def rectify(raw: RawFrame, maps: Maps | None) -> RgbdFrame:
     """Remove the lens distortion of a frame and convert its depth to meters.
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.calibration.correction import read_corrections
+from ldo_service.calibration.correction import read_correction
 from ldo_service.conversions.poses import pose_from_message
 from ldo_service.errors import DataError
 from ldo_service.evaluation.finished_run import Exposures, FinishedRun, PosedMap, RunFrame
@@ -158,7 +158,7 @@ class MapFolder:
         """
         rows = self.gaussians()
         labels = self._semantics(len(rows))
-        about = labels, read_corrections(self.folder), self.objects()
+        about = labels, read_correction(self.folder), self.objects()
         return PosedMap(name, rows, self.trajectory(), self.exposures(), *about)
 
 

@@ -18,7 +18,11 @@ import msgspec
 import numpy as np
 
 from ldo_service.config import Config, checked
-from ldo_service.conversions.frames import frame_from_message, mask_from_array
+from ldo_service.conversions.frames import (
+    camera_correction_from_message,
+    frame_from_message,
+    mask_from_array,
+)
 from ldo_service.errors import ConfigError, DeviceError
 from ldo_service.evaluation.finished_run import Exposures, FinishedRun, PosedMap
 from ldo_service.evaluation.views import view_of
@@ -204,8 +208,9 @@ class TrackedSource:
         for message in self.keyframes():
             frame, mask = frame_from_message(message), mask_from_array(message.dynamic_mask)
             T_map_keyframe = self.final_pose(message.stamp_ns)
+            correction = camera_correction_from_message(message.camera_correction)
             with builder.timed("all"):
-                builder.add(frame, T_map_keyframe, message.keyframe, effort, mask)
+                builder.add(frame, T_map_keyframe, message.keyframe, effort, mask, correction)
                 with builder.timed("view"):
                     builder.render_keyframe(message.keyframe)
             stamps[message.keyframe] = message.stamp_ns
@@ -260,7 +265,7 @@ class TrackedSource:
             ConfigError: No held-out frame lies before the last keyframe.
         """
         map_ = self.run.maps[0]
-        posed = PosedMap("trial", rows, map_.trajectory, exposures, None, map_.corrections)
+        posed = PosedMap("trial", rows, map_.trajectory, exposures, None, map_.correction)
         valid, found = valid_pixels(self.sequence.raw_camera), []
         for frame in self.run.frames:
             if not frame.is_held_out or frame.is_lost or frame.stamp_ns > last_ns:

@@ -10,7 +10,7 @@ import pytest
 from ldo_service.calibration.correction import (
     CameraCorrection,
     CorrectionChange,
-    read_corrections,
+    read_correction,
     unbiased_depth,
 )
 from ldo_service.calibration.estimation import estimate
@@ -229,21 +229,21 @@ def test_clipped_pixels_are_kept_for_tracking_and_darkened_for_the_map(
     np.testing.assert_allclose(mapped, expected, atol=1)
 
 
-def test_each_frame_has_the_correction_of_the_last_keyframe_before_it(tmp_path: Path) -> None:
+def test_a_run_has_the_correction_of_its_last_keyframe(tmp_path: Path) -> None:
     keyframes = [
-        {"stamp_ns": 10},
         {"stamp_ns": 20, "camera_correction": TRUE.pack()},
+        {"stamp_ns": 10},
     ]
     (tmp_path / "keyframes.json").write_text(json.dumps(keyframes))
-    history = read_corrections(tmp_path)
-    assert history.at(5) == history.at(19) == CameraCorrection()
-    assert history.at(20) == history.last == TRUE
+    assert read_correction(tmp_path) == TRUE
+    (tmp_path / "keyframes.json").write_text(json.dumps(keyframes[1:]))
+    assert read_correction(tmp_path) == CameraCorrection()
 
 
 def test_damaged_keyframes_are_an_error_of_the_file(tmp_path: Path) -> None:
     (tmp_path / "keyframes.json").write_text('[{"stamp_ns": 1, "camera_correction": 3}]')
     with pytest.raises(DataError, match=r"keyframes\.json does not have the format"):
-        read_corrections(tmp_path)
+        read_correction(tmp_path)
 
 
 def test_calibration_switched_off_keeps_the_correction_of_a_saved_state(

@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ldo_service.calibration.correction import CameraCorrection, CorrectionHistory
+from ldo_service.calibration.correction import CameraCorrection
 from ldo_service.calibration.shutter import ShutterTiming
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.errors import DataError
@@ -66,10 +66,9 @@ def moving_map(timing: ShutterTiming, jump_m: float = 0.0) -> PosedMap:
     T = np.tile(np.eye(4), (5, 1, 1))
     T[:, 0, 3] = 0.01 * np.arange(5)
     T[3:, 0, 3] += jump_m
-    corrections = CorrectionHistory((0,), (CameraCorrection(timing=timing),))
-    trajectory = Trajectory(np.arange(5) / 30, T)
+    trajectory, correction = Trajectory(np.arange(5) / 30, T), CameraCorrection(timing=timing)
     empty = Exposures(np.zeros(0, np.int64), np.zeros((0, 2, 3)))
-    return PosedMap("online", np.zeros((0, 16)), trajectory, empty, corrections=corrections)
+    return PosedMap("online", np.zeros((0, 16)), trajectory, empty, correction=correction)
 
 
 def test_motion_of_a_frame_comes_from_its_neighbors() -> None:

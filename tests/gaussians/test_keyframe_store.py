@@ -4,11 +4,13 @@ import logging
 import resource
 import signal
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from ldo_service.calibration.correction import CameraCorrection
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.gaussians import Exposure
 from ldo_service.gaussians.keyframe_store import KeyframeStore, KeyframeStoreConfig
@@ -180,6 +182,52 @@ def test_unusable_folder_raises_with_advice(tmp_path: Path) -> None:
 def test_invalid_settings_raise_config_error(change: dict) -> None:
     with pytest.raises(ConfigError):
         KeyframeStoreConfig(**change)
+
+
+# --- correction of the camera -----------------------------------------------------------------
+SEEN = CameraCorrection((0.01, 0.0, -0.02), ((-0.3, 0.0, 0.0), (-0.4, 0.1, 0.0), (-0.5, 0.0, 0.1)))
+BETTER = CameraCorrection((0.02, 0.01, 0.0), ((-0.6, 0.0, 0.0),) * 3)
+
+
+def test_images_are_converted_from_the_stored_ones_with_and_without_a_cache(
+    tmp_path: Path,
+) -> None:
+    stores = KeyframeStore(tmp_path / "a"), store_on_disk(tmp_path / "b", [])
+    for store in stores:
+        store.convert_to(CameraCorrection())
+        store.put(replace(images_of(1), correction=CameraCorrection()))
+        for correction in (SEEN, BETTER):
+            store.convert_to(correction)
+            images = store.get(1)
+            assert images is not None
+            # Converted twice, the colors would be rounded twice.
+            gains = correction.gain(CAMERA).transpose(2, 0, 1)
+            assert (
+                images.color == (images_of(1).color * gains + np.float32(0.5)).astype("u1")
+            ).all()
+            expected_m = correction.corrected_depth(images_of(1).depth_m, CAMERA)
+            np.testing.assert_allclose(images.depth_m, expected_m, rtol=1e-6)
+        store.convert_to(CameraCorrection())
+        assert_same(store.get(1), images_of(1))
+
+
+def test_masked_keyframe_keeps_its_stored_images(tmp_path: Path) -> None:
+    store, pixels = KeyframeStore(tmp_path), np.eye(48, 64, dtype=bool)
+    store.put(replace(images_of(1), correction=CameraCorrection()))
+    store.convert_to(SEEN)
+    store.mask_pixels(1, pixels)
+    masked = store.get(1)
+    assert masked is not None
+    assert masked.correction == SEEN
+    store.convert_to(CameraCorrection())
+    assert_same(store.get(1), replace(images_of(1), mask=(~pixels).astype(np.uint8)))
+
+
+def test_images_of_unknown_correction_stay_as_they_are(tmp_path: Path) -> None:
+    store = store_on_disk(tmp_path, [1])
+    assert images_of(1).correction is None
+    store.convert_to(SEEN)
+    assert_same(store.get(1), images_of(1))
 
 
 # --- quota ------------------------------------------------------------------------------------

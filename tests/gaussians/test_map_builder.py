@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ldo_service.calibration.correction import CameraCorrection
 from ldo_service.errors import ConfigError
 from ldo_service.evaluation.views import psnr
 from ldo_service.gaussians import GaussianOptimizerConfig, PruningConfig, render
@@ -102,6 +103,72 @@ def test_darker_keyframe_keeps_the_brightness_of_the_map(posed_frames: dict) -> 
     assert np.abs(builder.views.exposures[1].gain - 0.7).max() < 0.07  # A prior pulls it to 1.
     undarkened = build_map(posed_frames, iterations=4)
     assert mean_psnr(builder, posed_frames) > mean_psnr(undarkened, posed_frames) - 1.5
+
+
+def test_late_estimate_of_the_vignetting_corrects_the_map_and_its_keyframes(
+    posed_frames: dict, tmp_path: Path
+) -> None:
+    """The first keyframes were mapped as the camera recorded them, with dark corners."""
+    vignetting = CameraCorrection(vignetting=((-0.8, 0.0, 0.0),) * 3)
+    gain = vignetting.gain(
+        posed_frames[0][0].camera
+    )  # The strongest vignetting over that of a pixel.
+    recorded = {
+        i: (replace(frame, color=(frame.color * (gain.min() / gain)).astype(np.uint8)), T)
+        for i, (frame, T) in posed_frames.items()
+    }
+
+    def mapped(corrections: tuple[CameraCorrection, ...]) -> MapBuilder:
+        builder = MapBuilder(folder=tmp_path)
+        for keyframe, (i, correction) in enumerate(zip(KEYFRAMES, corrections, strict=True)):
+            frame, T = recorded[i]
+            builder.add(correction.applied(frame), T, keyframe, 10, correction=correction)
+        return builder
+
+    none = CameraCorrection()
+    before = mapped((none,) * 4)
+    late = mapped((none, none, none, vignetting))
+    factor = gain[gain.shape[0] // 2, gain.shape[1] // 2]
+    np.testing.assert_allclose(late.views.exposures[0].gain, factor)
+    np.testing.assert_allclose(before.views.exposures[0].gain, 1)
+    converted = late.views[1].color.transpose(1, 2, 0)
+    flat = posed_frames[KEYFRAMES[1]][0].color * gain.min()
+    assert np.abs(converted - flat).max() < 2
+    late.refine(60)
+    before.refine(60)
+    assert mean_psnr(late, posed_frames) > mean_psnr(before, posed_frames) + 3
+    restored = MapBuilder(folder=tmp_path)
+    restored.restore(late.snapshot())
+    for keyframe in range(4):
+        assert (restored.views[keyframe].color == late.views[keyframe].color).all()
+    assert restored.views.store.correction == vignetting
+
+
+def test_black_rim_of_rectification_is_not_mapped(posed_frames: dict) -> None:
+    """A keyframe whose rim is black must not darken the surface that other keyframes see."""
+    rim = np.ones((*posed_frames[0][0].depth_m.shape, 1), bool)
+    rim[12:-12, 12:-12] = False
+    cut = {
+        i: (
+            replace(frame, color=frame.color * ~rim, depth_m=frame.depth_m * ~rim[..., 0])
+            if i != KEYFRAMES[0]
+            else frame,
+            T,
+        )
+        for i, (frame, T) in posed_frames.items()
+    }
+    builder = build_map(cut, iterations=10)
+    mask = builder.views[1].mask
+    assert mask is not None
+    assert (mask == 0)[:13].all()
+    assert (mask > 0)[13:-13, 13:-13].all()
+    assert builder.views[0].mask is None
+    frame, T_map_camera = posed_frames[KEYFRAMES[0]]
+    rendered = render(builder.gaussians.rows, frame.camera, se3.inverse(T_map_camera)).color
+    whole = build_map(posed_frames, iterations=10)
+    expected = render(whole.gaussians.rows, frame.camera, se3.inverse(T_map_camera)).color
+    seen = frame.color / np.float32(255)
+    assert psnr(rendered.clip(0, 1), seen) > psnr(expected.clip(0, 1), seen) - 1
 
 
 def test_keyframes_damaged_on_disk_are_skipped(posed_frames: dict, tmp_path: Path) -> None:

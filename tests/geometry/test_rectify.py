@@ -7,10 +7,12 @@ from ldo_service.geometry import (
     Camera,
     RawFrame,
     Rectifier,
+    RgbdFrame,
     rectify,
     undistortion_maps,
     valid_pixels,
 )
+from ldo_service.geometry.frames import pixels_without_data
 from tests.geometry.cameras import FREIBURG1
 
 CAMERA = Camera(640, 480, 517.3, 516.5, 318.6, 255.3, FREIBURG1)
@@ -141,3 +143,19 @@ def test_valid_pixels_are_those_that_show_the_white_of_a_white_image() -> None:
     assert (shown[~valid] < 255).all()
     assert 0.5 < valid.mean() < 1.0
     assert valid_pixels(camera.rectified()) is None
+
+
+def test_pixels_without_data_are_the_rim_and_no_dark_hole_inside() -> None:
+    camera = Camera(64, 48, 60, 60, 31.5, 23.5, (0.3, -0.1, 0.0, 0.0, 0.0))
+    white = np.full((48, 64, 3), 255, np.uint8)
+    white[20:25, 30:40] = 0
+    depth = np.ones((48, 64), np.float32)
+    depth[20:25, 30:40] = 0
+    frame = rectify(RawFrame(0, 0, white, depth, 1.0, camera), undistortion_maps(camera))
+    rim, valid = pixels_without_data(frame), valid_pixels(camera)
+    assert valid is not None
+    assert rim[~valid].all()
+    inside = cv2.erode(valid.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=0) > 0
+    assert inside.any()
+    assert not rim[inside].any()
+    assert not pixels_without_data(RgbdFrame(white, depth, camera.rectified())).any()
