@@ -130,7 +130,7 @@ class Mapper(Actor):
         self._newest: tuple[int, int] = (0, -1)  # Stamp in ns and id of the newest keyframe.
         self._refit = LoopRefit(self._map, self.config.refit)
         self._requests = LabelRequests(self._ordered, self._map)
-        self._idle_steps = 0  # Idle steps since the last published changes.
+        self._idle_steps = 0  # Idle steps since the last checkpoint.
         self._is_still = False  # True if only label results came since the last corrected label.
         self._checkpoint: dict[str, Any] = {}
         self._repeated = 0
@@ -308,6 +308,7 @@ class Mapper(Actor):
     def on_idle(self) -> Iterator[Output]:
         """Refit the corrected map, send label requests, and repeat labelling with late results."""
         yield from self._label_requests()
+        self._idle_steps += 1
         if self._refit.has_work():
             yield from self._refit_idly()
         elif self._ordered.has_work():
@@ -315,28 +316,26 @@ class Mapper(Actor):
 
     def _refit_idly(self) -> Iterator[Output]:
         self._refit.while_idle()
-        self._idle_steps += 1
         is_done = not self._refit.has_work()
         if is_done:
             self._semantics.refresh()
         yield from self._refinement()
-        if is_done or self._idle_steps >= IDLE_STEPS_PER_DELTA:
-            yield from self._publish_changes()
+        yield from self._publish_changes(is_done=is_done)
 
     def _order_labels(self) -> Iterator[Output]:
         step = self._ordered.step()
         self._is_still = True
-        self._idle_steps += 1
         self._requests.add(step.requests, self._newest[0])
         yield from self._label_requests()
-        if step.is_done or self._idle_steps >= IDLE_STEPS_PER_DELTA:
-            yield from self._publish_changes()
+        yield from self._publish_changes(is_done=step.is_done)
 
-    def _publish_changes(self) -> Iterator[Output]:
-        self._idle_steps = 0
-        self._checkpoint = {}  # The next snapshot is a new checkpoint. A restart repeats less work.
-        yield from self._publisher.deltas(self._message_context(), with_changed=True)
-        yield from self._objects()
+    def _publish_changes(self, *, is_done: bool = True) -> Iterator[Output]:
+        """Publish the changes of some idle steps or of finished work, and save some of them."""
+        if is_done or self._idle_steps % IDLE_STEPS_PER_DELTA == 0:
+            yield from self._publisher.deltas(self._message_context(), with_changed=True)
+            yield from self._objects()
+        if is_done or self._idle_steps >= self._checkpoint_interval():
+            self._checkpoint = {}  # The next snapshot is a new checkpoint.
 
     def on_stop(self) -> Iterator[Output]:
         """Publish the final map after removing duplicate Gaussians of the newest keyframes."""
@@ -348,15 +347,10 @@ class Mapper(Actor):
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
-        """Return the last checkpoint of the map.
-
-        The checkpoint stays the same object until the next one is due; see
-        `MapperConfig.checkpoint_interval`.
-        """
+        """Return the last checkpoint of the map, the same object until the next one is due."""
         newest = self._newest[1]
         saved = self._checkpoint["newest"][1] if self._checkpoint else None
-        interval = self.config.checkpoint_interval(len(self._map.gaussians))
-        if newest >= 0 and (saved is None or newest - saved >= interval):
+        if newest >= 0 and (saved is None or newest - saved >= self._checkpoint_interval()):
             self._take_checkpoint()
         return {"map": self._checkpoint} if self._checkpoint else {}
 
@@ -364,7 +358,11 @@ class Mapper(Actor):
         self._checkpoint = {}
         return self.snapshot()
 
+    def _checkpoint_interval(self) -> int:
+        return self.config.checkpoint_interval(len(self._map.gaussians))
+
     def _take_checkpoint(self) -> None:
+        self._idle_steps = 0
         self._checkpoint = {
             "newest": self._newest,
             "map": self._map.snapshot(),

@@ -17,6 +17,7 @@ from ldo_service.gaussians.model import GaussianMap
 from ldo_service.regions.foreground import RegionDetections
 from ldo_service.regions.region import Region, RegionLabelResult, pack, unpack
 
+from .gaussian_labels import ROW
 from .object_landmarks import LANDMARK, NO_MEMBER
 from .objects import Objects
 from .semantic_map import SemanticMap
@@ -77,7 +78,7 @@ class DelayedCopy:
         """Return the state as plain values and arrays."""
         return {
             "semantics": self.semantics.snapshot(),
-            "labels": [self.labels.ids, self.labels.labels, self.labels.next_id],
+            "labels": [*self.labels.all(), self.labels.next_id],
             "first_object": self.first_object,
             "results_due": [pack(region) for region in self.results_due],
             "keyframes": [
@@ -102,6 +103,10 @@ class DelayedCopy:
         return DelayedCopy(semantics, labels, state["first_object"], due, keyframes)
 
 
+def _no_labels() -> tuple[np.ndarray, np.ndarray]:
+    return np.zeros(0, np.int64), np.zeros((0, ROW.itemsize), np.uint8)
+
+
 @dataclass(eq=False, slots=True)
 class GaussianLabels:
     """Labels of Gaussians that are stored apart from the map.
@@ -110,11 +115,15 @@ class GaussianLabels:
         ids: Ids of the Gaussians, [N], ascending.
         labels: Label rows of the Gaussians, [N, 32] uint8, see `gaussian_labels.ROW`.
         next_id: Minimum id of Gaussians that were created after these labels were stored.
+        absent: Ids [M] and label rows [M, 32] of further Gaussians, which were not in memory at the
+            end of the last `in_map` block. They are apart, so that the rows of consecutive blocks
+            usually fit the map as they are.
     """
 
     ids: np.ndarray
     labels: np.ndarray
     next_id: int
+    absent: tuple[np.ndarray, np.ndarray] = field(default_factory=_no_labels)
 
     @staticmethod
     def of(gaussians: GaussianMap) -> "GaussianLabels":
@@ -142,11 +151,19 @@ class GaussianLabels:
         if np.array_equal(self.ids, gaussians.ids):
             self.labels = gaussians.labels.copy()  # A saved state may refer to the old array.
             return
-        absent = ~np.isin(self.ids, gaussians.ids, assume_unique=True)
-        ids = np.concatenate([gaussians.ids, self.ids[absent]])
+        ids, labels = self.all()
+        is_absent = ~np.isin(ids, gaussians.ids, assume_unique=True)
+        self.absent = ids[is_absent], labels[is_absent]
+        self.ids, self.labels = gaussians.ids.copy(), gaussians.labels.copy()
+
+    def all(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the ids, ascending, and the label rows of all Gaussians."""
+        absent_ids, absent_labels = self.absent
+        if len(absent_ids) == 0:
+            return self.ids, self.labels
+        ids = np.concatenate([self.ids, absent_ids])
         order = np.argsort(ids)
-        self.labels = np.concatenate([gaussians.labels, self.labels[absent]])[order]
-        self.ids = ids[order]
+        return ids[order], np.concatenate([self.labels, absent_labels])[order]
 
     def write(self, gaussians: GaussianMap) -> np.ndarray:
         """Write the labels into a map, and return the indices of the changed rows.
@@ -167,13 +184,12 @@ class GaussianLabels:
         if np.array_equal(self.ids, gaussians.ids):
             return self.labels
         labels, ids = gaussians.labels.copy(), gaussians.ids
-        if len(self.ids) == 0:
-            labels[ids >= self.next_id] = 0
-            return labels
-        at = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
-        is_known = self.ids[at] == ids
         labels[ids >= self.next_id] = 0
-        labels[is_known] = self.labels[at[is_known]]
+        known_ids, known_labels = self.all()
+        if len(known_ids):
+            at = np.minimum(np.searchsorted(known_ids, ids), len(known_ids) - 1)
+            is_known = known_ids[at] == ids
+            labels[is_known] = known_labels[at[is_known]]
         return labels
 
 

@@ -31,7 +31,10 @@ def test_copy_keeps_its_own_labels_of_all_gaussians(later: list[int]) -> None:
             gaussians.labels[:] += step
         assert np.all(gaussians.labels == 100), "the map has its own labels again"
         expected |= {g: expected.get(g, 0) + step for g in later}
-        assert dict(zip(copy.ids.tolist(), copy.labels[:, 0].tolist(), strict=True)) == expected
+        ids, labels = copy.all()
+        assert dict(zip(ids.tolist(), labels[:, 0].tolist(), strict=True)) == expected
+        assert ids.tolist() == sorted(expected)
+        assert copy.ids.tolist() == later, "the next block needs no search"
     saved = copy.labels
     before = saved.copy()
     with copy.in_map(gaussians):
