@@ -196,7 +196,7 @@ class FrameSource(Actor):
         if min(width, height) < self.config.min_side_px:
             raise DataError(
                 f"the image of {width}x{height} pixels is too small to track: each side must have "
-                f"at least {self.config.min_side_px} pixels (frame_source.min_side_px)."
+                f"at least {self.config.min_side_px} pixels. Send larger images."
             )
 
     def _count_too_far(self, raw: RawFrame) -> None:

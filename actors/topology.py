@@ -146,7 +146,7 @@ def topics_table() -> str:
 
 
 def mermaid_diagram(boxes: Iterable[ActorSpec] = GRAPH) -> str:
-    """Return the graph in Mermaid, with solid arrows for inputs with the policy Lossless."""
+    """Return the graph in Mermaid, with solid arrows for the policies Lossless and Backlog."""
     lines = ["flowchart LR", "    camera([camera])", "    odometry([other odometry])"]
     boxes = tuple(boxes)
     lines.extend(f"    {box.name}" for box in boxes)

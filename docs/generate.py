@@ -280,8 +280,8 @@ WIDTH_PX, HEIGHT_PX, COLUMN_PX, ROW_PX = 120, 34, 170, 62
 def drawing() -> str:
     """Return an SVG drawing of the actors and their connections.
 
-    A solid arrow stands for at least one topic with the policy Lossless. A dashed arrow stands for
-    topics with other policies.
+    A solid arrow stands for at least one topic with the policy Lossless or Backlog. A dashed arrow
+    stands for topics with the policy Latest.
     """
     arrows = dict[tuple[str, str], bool]()
     for line in mermaid_diagram().splitlines():

@@ -68,7 +68,8 @@ class TrackedPose(Message, frozen=True, kw_only=True):
     """Camera pose at `stamp_ns`, published on pose/tracked (REP-105 frames).
 
     The status WEAK means that the pose is uncertain, and that the frame is not mapped. LOST means
-    that the pose of the frame is unknown. The message then repeats the last pose with status OK.
+    that the pose of the frame is unknown. The message then repeats the last pose with status OK or
+    WEAK.
     """
 
     frame: int  # Frame number, as in camera/rgbd.

@@ -1,8 +1,8 @@
 """Command `ldo`: its verbs, and the handling of errors.
 
 Exit codes: 0 success, 1 other errors, 2 bad arguments or configuration, 3 bad input data, 4 an
-actor failed, 5 a replay diverged, 130 interrupted. An error is printed as one paragraph;
---debug adds the traceback.
+actor failed, 5 a replay diverged, 6 a port, service or state folder cannot be used now, 130
+interrupted. An error is printed as one paragraph; --debug adds the traceback.
 """
 
 import logging

@@ -146,8 +146,8 @@ def evaluate(
     Without true poses, only the map is evaluated.
 
     The command writes trajectory.png and rendering.png into DIR. It also writes labels.png if the
-    source has true labels and a detector ran. `ldo run --hold-out-every 5` keeps every fifth frame
-    out of the map, so that the map can be evaluated on these frames.
+    source has true labels and a detector or a labeller ran. `ldo run --hold-out-every 5` keeps
+    every fifth frame out of the map, so that the map can be evaluated on these frames.
 
       ldo run ~/data/rgbd_dataset_freiburg1_desk --out runs/desk --hold-out-every 5
       ldo eval runs/desk ~/data/rgbd_dataset_freiburg1_desk

@@ -45,9 +45,8 @@ class AddKeys:
 
     Copy this folder to the machine of the program, and pass it to the program with --keys. The
     command also updates the access control list `access.yaml` in the folder of each service. Copy
-    the new list into the key folder of each running service. Services under systemd and services
-    with --client read their keys only at their start, so restart them. All other services use the
-    new list within seconds.
+    the new list into the key folder of each running service, which uses it within seconds. For a
+    separate router, make a new configuration with `ldo keys router`, and restart the router.
 
       ldo keys add DIR service mule --robot mule --host mule.local
       ldo keys add DIR camera front --robot mule
@@ -91,10 +90,9 @@ class ListKeys:
 class RevokeKeys:
     """Revoke keys, and delete their folder on this machine.
 
-    Copy the new `access.yaml` into the key folder of each running service. Services under systemd
-    and services with --client read their keys only at their start, so restart them. All other
-    services reject the revoked keys within seconds. For a separate router, make a new configuration
-    with `ldo keys router`, and restart the router.
+    Copy the new `access.yaml` into the key folder of each running service, which then rejects the
+    revoked keys within seconds. For a separate router, make a new configuration with
+    `ldo keys router`, and restart the router.
     """
 
     folder: Folder
@@ -159,8 +157,8 @@ def keys(verb: Verb) -> None:
             CertificateAuthority(verb.folder).remove(verb.name)
             print(
                 f"{verb.name} is revoked. Copy the new {ACCESS} into the key folder of every "
-                "service: until then the keys remain valid there. Restart each service under "
-                "systemd or with --client, which reads its keys only at its start."
+                "service: until then the keys remain valid there. For a separate router, run "
+                "`ldo keys router` again, and restart the router."
             )
 
 

@@ -66,7 +66,7 @@ class RosOptions:
         argument(
             metavar="TOPIC",
             help="depth registered to color; type Image, or CompressedImage if the name ends in "
-            "/compressedDepth",
+            "/compressed or /compressedDepth",
         ),
     ] = ""
     info: Annotated[

@@ -117,7 +117,10 @@ def record(
     out: Annotated[
         Path,
         tyro.conf.Positional,
-        argument(metavar="DIR", help="new folder for the recording: an MCAP file per actor"),
+        argument(
+            metavar="DIR",
+            help="folder for the recording, empty or with an earlier one: an MCAP file per actor",
+        ),
     ],
     robot: Robot = "robot",
     endpoint: EndpointAddress = DEFAULT_ENDPOINT,

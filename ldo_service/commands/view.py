@@ -42,7 +42,7 @@ def view(
     Ctrl-C ends the command.
 
       ldo view runs/desk
-      ldo view live --endpoint tls/mule.local:7447 --keys keys/desk
+      ldo view live --robot mule --endpoint tls/mule.local:7447 --keys keys/desk
     """
     require_viser()
     chosen = viewer_config(load_config(config, set).viewer)

@@ -133,8 +133,8 @@ class Slam:
                 unit is 1/depth_scale meters; it is 0, NaN or infinity where not measured.
             stamp_ns: Time of the exposure in ns, later than that of the last frame.
             prior: T_odom_camera [4, 4] of another odometry at the time of the exposure, such as
-                that of a phone; None if unknown. Only the motion between two priors is used. It
-                gives an initial guess, and replaces tracking while tracking is lost.
+                that of a phone; None if unknown. Only the motion between two priors is used, as an
+                initial guess.
 
         Returns:
             The pose of the frame.
