@@ -23,6 +23,7 @@ import threading
 import time
 from contextlib import ExitStack
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import msgspec
@@ -45,10 +46,17 @@ HOLD_OUT = "tracker.hold_out=5"
 
 
 class Observer:
-    """Subscriber of all topics that writes the folder of a run."""
+    """Subscriber of all topics that writes the folder of a run.
+
+    A thread of its own writes, because Zenoh drops messages to a subscriber whose callbacks are
+    slow.
+    """
 
     def __init__(self, session: zenoh.Session, network: Endpoint, writer: RunWriter) -> None:
-        self._writer, self._lock = writer, threading.Lock()
+        self._writer = writer
+        self._waiting: SimpleQueue[tuple[float, type[Any], bytes] | None] = SimpleQueue()
+        self._thread = threading.Thread(target=self._write, daemon=True)
+        self._thread.start()
         self.arrived_s: dict[int, float] = {}  # Arrival of the pose of each frame.
         self._keyframes: set[int] = set()
         topics = [out.topic for box in GRAPH for out in box.outputs]
@@ -61,27 +69,30 @@ class Observer:
         ]
 
     def _known(self, message: MapObjects) -> MapObjects:
-        """Return the objects that were first seen in a keyframe that arrived here.
-
-        A plain subscriber may miss messages of 2 MB, such as keyframes, on a busy machine.
-        """
+        """Return the objects that were first seen in a keyframe that arrived here."""
         arrived = self._keyframes
         objects = tuple(one for one in message.objects if one.first_keyframe in arrived)
         return msgspec.structs.replace(message, objects=objects)
 
     def _taker(self, kind: type[Any]):
-        def take(sample: zenoh.Sample) -> None:
-            message = decode(sample.payload.to_bytes(), kind)
-            with self._lock:
-                if isinstance(message, TrackedPose):
-                    self.arrived_s[message.frame] = time.monotonic()
-                if isinstance(message, Keyframe):
-                    self._keyframes.add(message.keyframe)
-                if isinstance(message, MapObjects):
-                    message = self._known(message)
-                self._writer.observe(message, 0.0)
+        return lambda sample: self._waiting.put((time.monotonic(), kind, sample.payload.to_bytes()))
 
-        return take
+    def _write(self) -> None:
+        while (arrived := self._waiting.get()) is not None:
+            at_s, kind, payload = arrived
+            message = decode(payload, kind)
+            if isinstance(message, TrackedPose):
+                self.arrived_s[message.frame] = at_s
+            if isinstance(message, Keyframe):
+                self._keyframes.add(message.keyframe)
+            if isinstance(message, MapObjects):
+                message = self._known(message)
+            self._writer.observe(message, 0.0)
+
+    def close(self) -> None:
+        """Write all messages that have arrived."""
+        self._waiting.put(None)
+        self._thread.join()
 
 
 def live(
@@ -111,6 +122,7 @@ def live(
         if service.wait(300) != 0:
             raise SystemExit(Path(log.name).read_text()[-3000:])
         time.sleep(1.0)  # The last messages may still be on their way.
+        observer.close()
         metrics = monitor.health["mapper"].metrics
     writer.close({"labeller_requests": writer.labeller_calls, "status": writer.statuses})
     ages_ms = [
@@ -121,6 +133,7 @@ def live(
         "poses": len(poses),
         "ok": poses.count("OK"),
         "keyframes": writer.keyframes,
+        "keyframes_mapped": metrics["keyframes"],
         "age_ms_p50": float(np.percentile(ages_ms, 50)),
         "age_ms_p95": float(np.percentile(ages_ms, 95)),
         "waiting_second_quarter": float(np.mean(waiting[quarter : 2 * quarter])),
