@@ -78,6 +78,8 @@ from ldo_service.semantics.ordered_semantics import OrderedSemantics
 
 # Idle steps between two messages with changed Gaussians: some seconds of work, up to 4 MB.
 IDLE_STEPS_PER_DELTA = 8
+# Idle steps that take as long as the mapping of a keyframe.
+IDLE_STEPS_PER_KEYFRAME = 4
 # Time without messages after which the camera stands still and late labels are corrected, seconds.
 # The result would depend on shorter pauses.
 STILL_AFTER_S = 5.0
@@ -334,7 +336,7 @@ class Mapper(Actor):
         if is_done or self._idle_steps % IDLE_STEPS_PER_DELTA == 0:
             yield from self._publisher.deltas(self._message_context(), with_changed=True)
             yield from self._objects()
-        if is_done or self._idle_steps >= self._checkpoint_interval():
+        if is_done or self._idle_steps >= IDLE_STEPS_PER_KEYFRAME * self._checkpoint_interval():
             self._checkpoint = {}  # The next snapshot is a new checkpoint.
 
     def on_stop(self) -> Iterator[Output]:

@@ -52,7 +52,7 @@ class MapperConfig:
             raise ConfigError(named(self, *counts) + " must be at least 1.")
 
     def checkpoint_interval(self, gaussians: int) -> int:
-        """Return the number of keyframes, or of idle steps, between two saved maps.
+        """Return the number of keyframes between two saved maps.
 
         The interval grows with the map, because the size of a saved map does too. After a crash, at
         most this many keyframes are mapped again.
