@@ -18,7 +18,8 @@ refined/                   trajectory, keyframes and map after further iteration
 
 Submaps that were never merged with the first one are not in the frame of the map. Their frames are
 not in the trajectories, and their Gaussians and objects are not in the map. semantics.npz and
-objects.json exist only if a detector ran, front_end.mcap and refined/ only if they were requested.
+objects.json exist only if a detector or a labeller ran. front_end.mcap and refined/ exist only if
+they were requested.
 
 A run with `--localize` makes no map. The map that it used, with keyframes.json, map.ply and
 keyframe_database.msgpack, is in the folder named by tracker.localization_map in config.yaml.
