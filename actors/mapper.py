@@ -132,7 +132,7 @@ class Mapper(Actor):
         self._newest: tuple[int, int] = (0, -1)  # Stamp in ns and id of the newest keyframe.
         self._refit = LoopRefit(self._map, self.config.refit)
         self._requests = LabelRequests(self._ordered, self._map)
-        self._idle_steps = 0  # Idle steps since the last checkpoint.
+        self._idle_steps = self._saved_steps = 0  # Idle steps in all, and at the last checkpoint.
         self._is_still = False  # True if only label results came since the last corrected label.
         self._checkpoint: dict[str, Any] = {}
         self._repeated = 0
@@ -336,7 +336,8 @@ class Mapper(Actor):
         if is_done or self._idle_steps % IDLE_STEPS_PER_DELTA == 0:
             yield from self._publisher.deltas(self._message_context(), with_changed=True)
             yield from self._objects()
-        if is_done or self._idle_steps >= IDLE_STEPS_PER_KEYFRAME * self._checkpoint_interval():
+        unsaved = self._idle_steps - self._saved_steps
+        if is_done or unsaved >= IDLE_STEPS_PER_KEYFRAME * self._checkpoint_interval():
             self._checkpoint = {}  # The next snapshot is a new checkpoint.
 
     def on_stop(self) -> Iterator[Output]:
@@ -364,7 +365,7 @@ class Mapper(Actor):
         return self.config.checkpoint_interval(len(self._map.gaussians))
 
     def _take_checkpoint(self) -> None:
-        self._idle_steps = 0
+        self._saved_steps = self._idle_steps
         self._checkpoint = {
             "newest": self._newest,
             "map": self._map.snapshot(),
@@ -378,8 +379,7 @@ class Mapper(Actor):
 
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
         saved = state["map"]
-        stamp_ns, keyframe = saved["newest"]
-        self._newest = (int(stamp_ns), int(keyframe))
+        self._newest = (int(saved["newest"][0]), int(saved["newest"][1]))
         self._map.restore(saved["map"])
         self._ordered.restore(saved["semantics"])
         self._poses.restore(saved["poses"])

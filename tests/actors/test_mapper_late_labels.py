@@ -5,6 +5,7 @@ from collections import deque
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -204,6 +205,23 @@ def test_mapper_restored_between_idle_steps_ends_with_equal_labels(tmp_path: Pat
     assert all(walk.mapper.metrics()["labels_reordered"] == 1 for walk in ends)
     assert len({walk.mapper._map.gaussians.labels.tobytes() for walk in ends}) == 1
     assert len({repr(walk.objects()) for walk in ends}) == 1
+
+
+def test_saving_the_state_changes_no_message_of_idle_steps(
+    late: Walk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A replay does not save the state, and must give the same messages."""
+    monkeypatch.setattr("ldo_service.actors.mapper.IDLE_STEPS_PER_KEYFRAME", 1)
+    saved = walk_with_late_labels()
+    saved.answer_all()
+    checkpoints = []
+    while saved.mapper.has_idle_work():
+        saved.take(saved.mapper.on_idle())
+        saved.answer_all()
+        checkpoints.append(saved.mapper.snapshot()["map"])
+    assert len({id(checkpoint) for checkpoint in checkpoints}) > 2
+    encode = msgspec.msgpack.encode
+    assert list(map(encode, saved.messages)) == list(map(encode, late.messages))
 
 
 def test_too_many_waiting_keyframes_keep_the_live_labels(monkeypatch: pytest.MonkeyPatch) -> None:
