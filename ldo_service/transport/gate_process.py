@@ -1,6 +1,7 @@
 """Process of the gate in front of the TLS port of a router; see `connection_gate`."""
 
 import logging
+import os
 import resource
 import socket
 import subprocess
@@ -94,9 +95,9 @@ class GateProcess:
         stdin = self._process.stdin
         assert stdin is not None
         # A process that has ended is started again with the new port; its input may be closed.
+        # A buffer would keep the line, and closing the input would fail because of it.
         with suppress(OSError, ValueError):
-            stdin.write(f"{router_port}\n")
-            stdin.flush()
+            os.write(stdin.fileno(), f"{router_port}\n".encode())
 
     def close(self) -> None:
         """End the process."""

@@ -4,6 +4,7 @@ import asyncio
 import socket
 import ssl
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -283,6 +284,32 @@ def test_gate_that_was_killed_is_started_again(
                 assert client.recv(1) == b""
         with tls_client(port, keys):
             assert process.pid != killed
+        process.close()
+
+
+def test_gate_that_was_redirected_while_it_ended_is_started_again(
+    router: EchoRouter, keys: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process that has closed its input stands for one that is about to end."""
+    close_input = "import os, time; os.close(0); print(1, flush=True); time.sleep(600)"
+    start, ending = GateProcess._start, list[subprocess.Popen[str]]()
+
+    def start_ending(_: GateProcess) -> subprocess.Popen[str]:
+        monkeypatch.setattr(GateProcess, "_start", start)
+        command = sys.executable, "-c", close_input
+        pipe = subprocess.PIPE
+        ending.append(subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True))
+        assert ending[0].stdout is not None
+        ending[0].stdout.readline()
+        return ending[0]
+
+    monkeypatch.setattr(GateProcess, "_start", start_ending)
+    with socket.create_server((LOOPBACK, 0)) as listener:
+        process, port = GateProcess(listener, 1), listener.getsockname()[1]
+        process.redirect(router.port)
+        ending[0].kill()
+        with tls_client(port, keys):
+            assert router.accepted == 1
         process.close()
 
 
