@@ -109,10 +109,8 @@ class Mailbox:
             transport.subscribe(
                 producer_hello_key(topic), lambda _, body: self._welcomed(link, body)
             )
-            has_backlog = isinstance(port.policy, Backlog)
-            transport.subscribe(
-                retransmit_key(topic, self._consumer if has_backlog else ""), arrived
-            )
+            own = self._consumer if isinstance(port.policy, Backlog) else ""
+            transport.subscribe(retransmit_key(topic, own), arrived)
         transport.subscribe(data_key(topic), arrived)
 
     # --- arriving, on any thread --------------------------------------------------------------
@@ -142,7 +140,8 @@ class Mailbox:
         if limit is not None and size_bytes > limit:
             return f"its {size_bytes} bytes exceed the {limit} bytes of this topic"
         if size_bytes > self._max_bytes:
-            return f"its {size_bytes} bytes exceed service.max_decoded_message_mb"
+            setting = f"service.max_decoded_message_mb={self._max_bytes / 1e6:g}"
+            return f"its {size_bytes} bytes exceed {setting}. Raise it, or send smaller images"
         return ""
 
     def _reject(self, inlet: Inlet, why: str) -> None:
