@@ -313,6 +313,39 @@ def test_gate_that_was_redirected_while_it_ended_is_started_again(
         process.close()
 
 
+def test_gate_that_was_redirected_while_it_was_started_leads_to_the_other_router(
+    router: EchoRouter, keys: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start, is_started, may_return = GateProcess._start, threading.Event(), threading.Event()
+
+    def start_slowly(process: GateProcess) -> subprocess.Popen[str]:
+        started = start(process)
+        is_started.set()
+        assert may_return.wait(PATIENCE_S)
+        return started
+
+    other = EchoRouter(keys)
+    with socket.create_server((LOOPBACK, 0)) as listener:
+        process, port = GateProcess(listener, router.port), listener.getsockname()[1]
+        monkeypatch.setattr(GateProcess, "_start", start_slowly)
+        process._process.kill()
+        assert is_started.wait(PATIENCE_S)
+        redirecting = threading.Thread(target=process.redirect, args=(other.port,))
+        redirecting.start()
+        redirecting.join(0.2)  # It should wait for the start.
+        may_return.set()
+        redirecting.join()
+
+        def reaches_other_router() -> bool:
+            with suppress(OSError, AssertionError), tls_client(port, keys):
+                pass  # The redirection may close a connection that was accepted before it.
+            return other.accepted > 0
+
+        eventually(reaches_other_router)
+        process.close()
+    other.close()
+
+
 def test_redirected_gate_closes_its_connections_and_leads_to_the_other_router(
     router: EchoRouter, keys: Path
 ) -> None:
