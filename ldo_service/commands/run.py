@@ -174,7 +174,10 @@ def print_results(record: RunWriter, out: Path, localize: Path | None) -> None:
 
 
 def execute(
-    job: RunOptions, go: Callable[[RunOptions, Advance], RunWriter], console: Console
+    job: RunOptions,
+    go: Callable[[RunOptions, Advance], RunWriter],
+    console: Console,
+    title: str = "run",
 ) -> RunWriter:
     """Run a job with a progress bar.
 
@@ -182,11 +185,12 @@ def execute(
         job: Sequence, folder and options of the run.
         go: Function that runs the job: `run_offline` or `run_realtime`.
         console: Console of the progress bar.
+        title: Title of the progress bar.
 
     Raises:
         ConfigError: The folder of the run cannot be written.
     """
-    with progress("run", job.work, console) as advance:
+    with progress(title, job.work, console) as advance:
         try:
             return go(job, advance)
         except OSError as error:
