@@ -63,7 +63,7 @@ from ldo_service.transport.zenoh_transport import Endpoint, ZenohTransport, open
 
 from .metrics import HealthCollector
 from .metrics_server import serve_metrics
-from .state_folder import PAUSE_MARKER, RESET_MARKER, claim_state
+from .state_folder import PAUSE_MARKER, RESET_MARKER, claim_state, write_config
 
 log = logging.getLogger(__name__)
 
@@ -337,8 +337,7 @@ class Service:
         return open_recorder(self.recording, actor, self.network.robot, self.config, map_folder)
 
     def _child(self, box: ActorSpec, transport: ZenohTransport) -> ChildProcess:
-        config = self.state / "config.yaml"
-        config.write_text(config_yaml(self.config))
+        config = write_config(self.state, config_yaml(self.config))
         command = python_command(
             *("serve", "--actor", box.name, "--robot", self.network.robot),
             *("--endpoint", self.network.local_endpoint),
