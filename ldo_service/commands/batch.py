@@ -32,6 +32,7 @@ from .options import (
     Settings,
     Stride,
     argument,
+    note_console,
     with_device,
     with_preset,
 )
@@ -138,7 +139,7 @@ def batch(
       ldo batch s3://robots/night s3://robots/day/*.mcap --out s3://results/night --export splat
       ldo batch --sources-from list.txt --out /shared/results --cluster auto --workers 20
     """
-    console = Console(stderr=True, highlight=False, markup=False)
+    console = note_console()
     settings = with_preset(set, preset)
     plan = _plan(
         *(config, settings, hold_out_every, stride, max_frames, refine_iterations, export),
@@ -195,7 +196,7 @@ def _found(
     words = [*sources, *(listed(sources_from) if sources_from else ())]
     if not words:
         raise ConfigError("no SOURCES are given. Name recordings, or use --sources-from FILE.")
-    return find_recordings(words, lambda note: console.print(f"batch: {note}", soft_wrap=True))
+    return find_recordings(words, lambda note: console.print(f"batch: {note}"))
 
 
 def _executor(
@@ -293,7 +294,7 @@ class _Progress:
         what = {"done": f"done{spent}", "kept": "kept from an earlier call"}
         text = what.get(outcome.status, f"{outcome.status}: {outcome.error}")
         line = f"{self._done} of {self._total}: {outcome.name} {text}{self._left()}"
-        self._console.print(line, soft_wrap=True)
+        self._console.print(line)
 
     def _left(self) -> str:
         if not 0 < self._finished < self._all:

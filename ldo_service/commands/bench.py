@@ -29,6 +29,7 @@ from .options import (
     Source,
     argument,
     image_size,
+    note_console,
     progress,
     with_device,
 )
@@ -272,7 +273,7 @@ def bench_map(verb: BenchMap, device: str = "cpu") -> None:
     sequence, mapper = open_sequence(verb.source), actor_parameters(config).mapper
     with tempfile.TemporaryDirectory() as temporary:
         runs = (verb.runs or Path(temporary)).expanduser()
-        with progress("track", min(verb.frames, len(sequence)), Console(stderr=True)) as advance:
+        with progress("track", min(verb.frames, len(sequence)), note_console()) as advance:
             tracked = TrackedSource.record(sequence, verb.frames, config, runs, advance)
         found = tracked.measure(mapper.builder, mapper.iterations, verb.refine_iterations)
     if baseline:

@@ -21,7 +21,7 @@ from ldo_service.schemas import MapObjects
 from ldo_service.synthetic import FlatSequence
 from ldo_service.synthetic.flat.sequence import prerender
 
-from .options import Overwrite, argument, progress
+from .options import Overwrite, argument, note_console, progress
 from .run import execute, with_options
 
 FRAMES = 70  # The first frames of the synthetic flat, which show its first room.
@@ -46,7 +46,7 @@ def demo(
     other synthetic rooms and recognize objects in synthetic rooms only. The settings that separate
     objects by depth were tuned on this room.
     """
-    console = Console(stderr=True)
+    console = note_console()
     sequence = FlatSequence.named("flat")
     prepare(out, overwrite)
     with progress("ray casting", FRAMES, console) as advance:
@@ -60,7 +60,7 @@ def demo(
     size = f"{sequence.camera.width}x{sequence.camera.height}"
     for row in rows(record.summary, size, results, read_objects(out)):
         printed.add_row(*row)
-    Console(highlight=False).print(printed)
+    Console(highlight=False, markup=False).print(printed)
 
 
 def demo_config() -> Config:

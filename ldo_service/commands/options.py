@@ -191,6 +191,11 @@ def image_size(text: str) -> tuple[int, int]:
     return int(sides[0]), int(sides[1])
 
 
+def note_console() -> Console:
+    """Return a console for notes and progress, whose text may contain paths with brackets."""
+    return Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
+
+
 @contextmanager
 def progress(title: str, total: int, console: Console) -> Iterator[Advance]:
     """Show progress while the context is open.

@@ -40,6 +40,7 @@ from .options import (
     Stride,
     Topics,
     argument,
+    note_console,
     progress,
     with_topics,
 )
@@ -95,7 +96,7 @@ def publish(
       ldo publish realsense --size 848x480
       ldo publish ros2 --color /camera/color/image_raw --depth /camera/aligned_depth/image_raw
     """
-    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    console = note_console()
     selection = Selection(stride, max_frames)
     if source in (REALSENSE, ROS2):
         require_no_sequence(

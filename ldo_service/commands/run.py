@@ -36,6 +36,7 @@ from .options import (
     Topics,
     argument,
     localizing,
+    note_console,
     progress,
     with_device,
     with_preset,
@@ -140,7 +141,7 @@ def run(
         }
     )
     require_separate(localize, out, refine_iterations)
-    console = Console(stderr=True)
+    console = note_console()
     loaded = load_config(config, with_topics(with_preset(set, preset), topic))
     settings = localizing(with_options(loaded, hold_out_every, threads), localize)
     settings = with_device(settings, device)
@@ -165,7 +166,7 @@ def run(
 
 def print_results(record: RunWriter, out: Path, localize: Path | None) -> None:
     """Print the summary of a finished run, with notes on unmerged submaps and on localization."""
-    console = Console()
+    console = Console(markup=False)
     console.print(summary_table(record.summary, out))
     if record.summary["gaussians_unmerged"]:
         console.print(format_unmerged(record.summary["gaussians_unmerged"]), style="dim")

@@ -5,13 +5,12 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.evaluation.lpips import Lpips
 from ldo_service.suites import SuiteRun, SuiteRunner, load_suite, markdown
 
-from .options import Overwrite, Settings, argument
+from .options import Overwrite, Settings, argument, note_console
 
 TABLE = "table.md"
 
@@ -70,12 +69,12 @@ def suite(
     folders = data.expanduser(), out.expanduser()
     work = SuiteRunner(chosen, *folders, set, overwrite, workers, lpips)
     _require_folder(work.out)
-    console, total = Console(stderr=True), len(work.entries())
+    console, total = note_console(), len(work.entries())
     done: list[SuiteRun] = []
 
     def begun(entry: SuiteRun) -> None:
         done.append(entry)
-        console.print(f"{len(done)} of {total}: {entry.folder}", highlight=False)
+        console.print(f"{len(done)} of {total}: {entry.folder}")
 
     outcomes = list(work.outcomes(begun))
     if all(outcome.missing == "no data" for outcome in outcomes):
