@@ -281,9 +281,9 @@ def _of_answers(health: Health) -> Iterator[str]:
             f"rejected {refused:.0f} of {questions:.0f} label results, because they had no label "
             "or a label outside the vocabulary; the regions of these results have no label"
         )
-    if untold := health.metrics.get("answers_without_logprobs"):
+    if without := health.metrics.get("answers_without_logprobs"):
         yield (
-            f"received {untold:.0f} label results without log-probabilities; their confidence is "
+            f"received {without:.0f} label results without log-probabilities; their confidence is "
             "vlm_labeller.http.default_confidence"
         )
     if refused := health.metrics.get("names_refused"):
