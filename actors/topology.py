@@ -35,58 +35,32 @@ class ActorParameters:
 
 @dataclass(frozen=True, slots=True)
 class ActorSpec:
-    """Name, purpose, ports and factory of an actor."""
+    """Name, ports and factory of an actor."""
 
     name: str
-    does: str  # Purpose of the actor, in the imperative.
     inputs: tuple[In, ...]
     outputs: tuple[Out, ...]
     is_backend: bool  # True if no other actor waits for its outputs.
     make: Callable[[ActorParameters], Actor]
 
 
-def _box(actor: type[Actor], does: str, make: Callable[[ActorParameters], Actor]) -> ActorSpec:
-    return ActorSpec(actor.name, does, actor.inputs, actor.outputs, actor.is_backend, make)
+def _box(actor: type[Actor], make: Callable[[ActorParameters], Actor]) -> ActorSpec:
+    return ActorSpec(actor.name, actor.inputs, actor.outputs, actor.is_backend, make)
 
 
 GRAPH: tuple[ActorSpec, ...] = (
-    _box(
-        FrameSource,
-        "check and rectify camera frames",
-        lambda parameters: FrameSource(parameters.frame_source),
-    ),
-    _box(
-        Tracker,
-        "track the camera pose",
-        lambda parameters: Tracker(parameters.tracker),
-    ),
-    _box(
-        Detector,
-        "detect objects of known classes",
-        lambda parameters: Detector(parameters.detector),
-    ),
-    _box(
-        VlmLabeller,
-        "label regions that the detector does not know",
-        lambda parameters: VlmLabeller(parameters.vlm_labeller),
-    ),
+    _box(FrameSource, lambda parameters: FrameSource(parameters.frame_source)),
+    _box(Tracker, lambda parameters: Tracker(parameters.tracker)),
+    _box(Detector, lambda parameters: Detector(parameters.detector)),
+    _box(VlmLabeller, lambda parameters: VlmLabeller(parameters.vlm_labeller)),
     _box(
         Mapper,
-        "build the map of Gaussians and objects",
         lambda parameters: Mapper(
             parameters.mapper, has_labeller=parameters.vlm_labeller.is_chosen
         ),
     ),
-    _box(
-        LoopCloser,
-        "detect loop closures",
-        lambda parameters: LoopCloser(parameters.loop_closer),
-    ),
-    _box(
-        Optimizer,
-        "optimize the pose graph",
-        lambda parameters: Optimizer(parameters.optimizer),
-    ),
+    _box(LoopCloser, lambda parameters: LoopCloser(parameters.loop_closer)),
+    _box(Optimizer, lambda parameters: Optimizer(parameters.optimizer)),
 )
 
 
