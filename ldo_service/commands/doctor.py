@@ -327,7 +327,7 @@ def seen(
                 heard.setdefault(health.actor, []).append((time.monotonic(), health))
             time.sleep(0.05)
         alive, now_s = client.live_actors(), time.monotonic()
-    names = [box.name for box in GRAPH]
+    names = [spec.name for spec in GRAPH]
     names += sorted((set(heard) | alive) - set(names))  # Actors of a later version.
     actors = [
         ActorStatus(name, name in alive, None, window_s)

@@ -162,7 +162,7 @@ def _of_backlogs(health: Health) -> Iterator[Problem]:
 
 
 def _is_backend(actor: str) -> bool:
-    return any(box.name == actor and box.is_backend for box in GRAPH)
+    return any(spec.name == actor and spec.is_backend for spec in GRAPH)
 
 
 def _of_disk(health: Health) -> Iterator[Problem]:
