@@ -189,12 +189,12 @@ class LoopCloser(Actor):
         waiting, boxes = self._waiting.pop(keyframe), self._boxes.pop(keyframe, None)
         self._boxes = {k: b for k, b in self._boxes.items() if k > keyframe}
         self._without_boxes += boxes is None
-        place, sightings = self._masked_keyframe(waiting, boxes)
+        place, points = self._masked_keyframe(waiting, boxes)
         results = self.recognizer.add(
             place,
             waiting.frame,
             waiting.stamp_ns,
-            sightings,
+            points,
             self.poses,
             self._merged_submaps,
             self._objects,
@@ -218,9 +218,9 @@ class LoopCloser(Actor):
         times = waiting.width_px / place.camera.width
         found = scale_boxes(boxes.detections, times)
         place = place.without(dynamic_class_mask(found, place.depth_m, movable))
-        return place, self._sightings(boxes.detections, place, times)
+        return place, self._detection_points(boxes.detections, place, times)
 
-    def _sightings(
+    def _detection_points(
         self, detections: tuple[Detection, ...], place: KeyframeRecord, times: float
     ) -> DetectionPoints:
         standing = [d for d in detections if d.label not in self.config.movable.classes]

@@ -35,58 +35,32 @@ class ActorParameters:
 
 @dataclass(frozen=True, slots=True)
 class ActorSpec:
-    """Name, purpose, ports and factory of an actor."""
+    """Name, ports and factory of an actor."""
 
     name: str
-    does: str  # Purpose of the actor, in the imperative.
     inputs: tuple[In, ...]
     outputs: tuple[Out, ...]
     is_backend: bool  # True if no other actor waits for its outputs.
     make: Callable[[ActorParameters], Actor]
 
 
-def _box(actor: type[Actor], does: str, make: Callable[[ActorParameters], Actor]) -> ActorSpec:
-    return ActorSpec(actor.name, does, actor.inputs, actor.outputs, actor.is_backend, make)
+def _spec(actor: type[Actor], make: Callable[[ActorParameters], Actor]) -> ActorSpec:
+    return ActorSpec(actor.name, actor.inputs, actor.outputs, actor.is_backend, make)
 
 
 GRAPH: tuple[ActorSpec, ...] = (
-    _box(
-        FrameSource,
-        "check and rectify camera frames",
-        lambda parameters: FrameSource(parameters.frame_source),
-    ),
-    _box(
-        Tracker,
-        "track the camera pose",
-        lambda parameters: Tracker(parameters.tracker),
-    ),
-    _box(
-        Detector,
-        "detect objects of known classes",
-        lambda parameters: Detector(parameters.detector),
-    ),
-    _box(
-        VlmLabeller,
-        "label regions that the detector does not know",
-        lambda parameters: VlmLabeller(parameters.vlm_labeller),
-    ),
-    _box(
+    _spec(FrameSource, lambda parameters: FrameSource(parameters.frame_source)),
+    _spec(Tracker, lambda parameters: Tracker(parameters.tracker)),
+    _spec(Detector, lambda parameters: Detector(parameters.detector)),
+    _spec(VlmLabeller, lambda parameters: VlmLabeller(parameters.vlm_labeller)),
+    _spec(
         Mapper,
-        "build the map of Gaussians and objects",
         lambda parameters: Mapper(
             parameters.mapper, has_labeller=parameters.vlm_labeller.is_chosen
         ),
     ),
-    _box(
-        LoopCloser,
-        "detect loop closures",
-        lambda parameters: LoopCloser(parameters.loop_closer),
-    ),
-    _box(
-        Optimizer,
-        "optimize the pose graph",
-        lambda parameters: Optimizer(parameters.optimizer),
-    ),
+    _spec(LoopCloser, lambda parameters: LoopCloser(parameters.loop_closer)),
+    _spec(Optimizer, lambda parameters: Optimizer(parameters.optimizer)),
 )
 
 
@@ -96,16 +70,16 @@ def actor_spec(name: str) -> ActorSpec:
     Raises:
         ConfigError: There is no such actor.
     """
-    for box in GRAPH:
-        if box.name == name:
-            return box
-    names = ", ".join(box.name for box in GRAPH)
+    for spec in GRAPH:
+        if spec.name == name:
+            return spec
+    names = ", ".join(spec.name for spec in GRAPH)
     raise ConfigError(f"there is no actor {name!r}. Choose one of {names}.")
 
 
 def make_actors(parameters: ActorParameters) -> list[Actor]:
     """Return new instances of all actors, producers first."""
-    return [box.make(parameters) for box in GRAPH]
+    return [spec.make(parameters) for spec in GRAPH]
 
 
 def producer_of(topic: t.Topic) -> str:
@@ -114,9 +88,9 @@ def producer_of(topic: t.Topic) -> str:
     The result is `outside` if other programs publish it, `every actor` if each actor does, and
     `none` if it has no producer.
     """
-    for box in GRAPH:
-        if any(out.topic is topic for out in box.outputs):
-            return box.name
+    for spec in GRAPH:
+        if any(out.topic is topic for out in spec.outputs):
+            return spec.name
     if topic is t.HEALTH:
         return "every actor"
     if topic is t.CONTROL:
@@ -130,7 +104,10 @@ def consumers_of(topic: t.Topic) -> list[tuple[str, str]]:
     if topic is t.CONTROL:
         return [("the service", "(one request at a time)")]
     return [
-        (box.name, str(port.policy)) for box in GRAPH for port in box.inputs if port.topic is topic
+        (spec.name, str(port.policy))
+        for spec in GRAPH
+        for port in spec.inputs
+        if port.topic is topic
     ]
 
 
@@ -145,23 +122,23 @@ def topics_table() -> str:
     return "\n".join(lines)
 
 
-def mermaid_diagram(boxes: Iterable[ActorSpec] = GRAPH) -> str:
+def mermaid_diagram(specs: Iterable[ActorSpec] = GRAPH) -> str:
     """Return the graph in Mermaid, with solid arrows for the policies Lossless and Backlog."""
     lines = ["flowchart LR", "    camera([camera])", "    odometry([other odometry])"]
-    boxes = tuple(boxes)
-    lines.extend(f"    {box.name}" for box in boxes)
-    for box in boxes:
-        for port in box.inputs:
+    specs = tuple(specs)
+    lines.extend(f"    {spec.name}" for spec in specs)
+    for spec in specs:
+        for port in spec.inputs:
             arrow = "-->" if isinstance(port.policy, Lossless) else "-.->"
             lines.extend(
-                f"    {maker} {arrow}|{port.topic.name}| {box.name}"
-                for maker in _makers(port.topic, boxes)
+                f"    {maker} {arrow}|{port.topic.name}| {spec.name}"
+                for maker in _makers(port.topic, specs)
             )
     return "\n".join(lines)
 
 
-def _makers(topic: t.Topic, boxes: tuple[ActorSpec, ...]) -> list[str]:
-    makers = [box.name for box in boxes if any(out.topic is topic for out in box.outputs)]
+def _makers(topic: t.Topic, specs: tuple[ActorSpec, ...]) -> list[str]:
+    makers = [spec.name for spec in specs if any(out.topic is topic for out in spec.outputs)]
     if topic in t.FROM_ODOMETRY:
         return ["odometry"]
     return makers or (["camera"] if topic in t.FROM_OUTSIDE else [])

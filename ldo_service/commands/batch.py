@@ -32,6 +32,7 @@ from .options import (
     Settings,
     Stride,
     argument,
+    note_console,
     with_device,
     with_preset,
 )
@@ -43,78 +44,88 @@ STAGED_GB = 20.0
 WIDTH = 170  # Columns of the table when the output is no terminal.
 
 
+Sources = Annotated[
+    tuple[str, ...],
+    tyro.conf.Positional,
+    argument(
+        metavar="SOURCES",
+        help="recordings, as for `ldo run`; folders or buckets of recordings; patterns such as "
+        "'s3://bucket/night/*'",
+    ),
+]
+Out = Annotated[
+    str, argument(metavar="WHERE", help="folder or bucket for the results: DIR, s3://..., ...")
+]
+SourcesFrom = Annotated[
+    Path | None, argument(metavar="FILE", help="text file with more SOURCES, one per line")
+]
+RefineIterations = Annotated[
+    int, argument(metavar="N", help="optimize each map for N more iterations at the end")
+]
+Exports = Annotated[
+    tyro.conf.UseAppendAction[tuple[ExportFormat, ...]],
+    argument(metavar="FORMAT", help="also write a format of `ldo export`; may be repeated"),
+]
+Workers = Annotated[
+    int | None,
+    argument(
+        metavar="N",
+        help="recordings at the same time; default: as many as the cores and the memory of "
+        "this machine, or the hosts of the cluster, allow",
+    ),
+]
+Threads = Annotated[
+    int,
+    argument(
+        metavar="T",
+        help="threads for each recording, and with --cluster the CPUs reserved for it",
+    ),
+]
+MemoryGb = Annotated[
+    float, argument(metavar="GB", help="memory that is reserved for each recording")
+]
+Cluster = Annotated[
+    str | None,
+    argument(
+        metavar="ADDRESS", help="run on this Ray cluster: HOST:PORT, or auto for the local one"
+    ),
+]
+Gpus = Annotated[float, argument(metavar="N", help="GPUs of the cluster for each recording")]
+Staging = Annotated[
+    Path | None,
+    argument(
+        metavar="DIR",
+        help="folder on each machine for unfinished results and copies of recordings; default: "
+        "WHERE/.staging, but with a bucket or --cluster the temporary folder of the system",
+    ),
+]
+MaxStagedGb = Annotated[
+    float,
+    argument(metavar="GB", help="maximum total size of the copies of recordings, for each machine"),
+]
+
+
 def batch(
-    sources: Annotated[
-        tuple[str, ...],
-        tyro.conf.Positional,
-        argument(
-            metavar="SOURCES",
-            help="recordings, as for `ldo run`; folders or buckets of recordings; patterns such as "
-            "'s3://bucket/night/*'",
-        ),
-    ] = (),
+    sources: Sources = (),
     *,
-    out: Annotated[
-        str, argument(metavar="WHERE", help="folder or bucket for the results: DIR, s3://..., ...")
-    ],
-    sources_from: Annotated[
-        Path | None, argument(metavar="FILE", help="text file with more SOURCES, one per line")
-    ] = None,
+    out: Out,
+    sources_from: SourcesFrom = None,
     preset: Preset = "",
     config: ConfigFile = None,
     set: Settings = (),
     max_frames: MaxFrames = None,
     stride: Stride = 1,
     hold_out_every: HoldOutEvery = None,
-    refine_iterations: Annotated[
-        int, argument(metavar="N", help="optimize each map for N more iterations at the end")
-    ] = 0,
-    export: Annotated[
-        tyro.conf.UseAppendAction[tuple[ExportFormat, ...]],
-        argument(metavar="FORMAT", help="also write a format of `ldo export`; may be repeated"),
-    ] = (),
-    workers: Annotated[
-        int | None,
-        argument(
-            metavar="N",
-            help="recordings at the same time; default: as many as the cores and the memory of "
-            "this machine, or the hosts of the cluster, allow",
-        ),
-    ] = None,
-    threads: Annotated[
-        int,
-        argument(
-            metavar="T",
-            help="threads for each recording, and with --cluster the CPUs reserved for it",
-        ),
-    ] = 1,
+    refine_iterations: RefineIterations = 0,
+    export: Exports = (),
+    workers: Workers = None,
+    threads: Threads = 1,
     device: Device = None,
-    memory_gb: Annotated[
-        float, argument(metavar="GB", help="memory that is reserved for each recording")
-    ] = MEMORY_GB,
-    cluster: Annotated[
-        str | None,
-        argument(
-            metavar="ADDRESS", help="run on this Ray cluster: HOST:PORT, or auto for the local one"
-        ),
-    ] = None,
-    gpus: Annotated[
-        float, argument(metavar="N", help="GPUs of the cluster for each recording")
-    ] = 0.0,
-    staging: Annotated[
-        Path | None,
-        argument(
-            metavar="DIR",
-            help="folder on each machine for unfinished results and copies of recordings; default: "
-            "WHERE/.staging, but with a bucket or --cluster the temporary folder of the system",
-        ),
-    ] = None,
-    max_staged_gb: Annotated[
-        float,
-        argument(
-            metavar="GB", help="maximum total size of the copies of recordings, for each machine"
-        ),
-    ] = STAGED_GB,
+    memory_gb: MemoryGb = MEMORY_GB,
+    cluster: Cluster = None,
+    gpus: Gpus = 0.0,
+    staging: Staging = None,
+    max_staged_gb: MaxStagedGb = STAGED_GB,
 ) -> None:
     """Run, evaluate and export many recordings, on this machine or on a Ray cluster.
 
@@ -128,28 +139,18 @@ def batch(
       ldo batch s3://robots/night s3://robots/day/*.mcap --out s3://results/night --export splat
       ldo batch --sources-from list.txt --out /shared/results --cluster auto --workers 20
     """
-    console = Console(stderr=True, highlight=False, markup=False)
+    console = note_console()
+    settings = with_preset(set, preset)
     plan = _plan(
-        config,
-        with_preset(set, preset),
-        hold_out_every,
-        stride,
-        max_frames,
-        refine_iterations,
-        export,
-        threads,
-        device,
+        *(config, settings, hold_out_every, stride, max_frames, refine_iterations, export),
+        *(threads, device),
     )
     _require_positive(
         workers=workers, threads=threads, memory_gb=memory_gb, max_staged_gb=max_staged_gb
     )
     where = open_store(out)
     executor = _executor(cluster, RayNeeds(threads, memory_gb, gpus), workers, device)
-    words = [*sources, *(listed(sources_from) if sources_from else ())]
-    if not words:
-        raise ConfigError("no SOURCES are given. Name recordings, or use --sources-from FILE.")
-    note = lambda text: console.print(f"batch: {text}", soft_wrap=True)  # noqa: E731
-    found = find_recordings(words, note)
+    found = _found(sources, sources_from, console)
     work = Batch(
         plan, where, staging or _default_staging(where, cluster), round(max_staged_gb * 1e9)
     )
@@ -182,6 +183,20 @@ def _plan(
         exports=tuple(dict.fromkeys(exports)),
         threads=threads,
     )
+
+
+def _found(
+    sources: Sequence[str], sources_from: Path | None, console: Console
+) -> dict[str, LdoError | None]:
+    """Find the recordings, and print notes about sources that contain none.
+
+    Raises:
+        ConfigError: No sources are given.
+    """
+    words = [*sources, *(listed(sources_from) if sources_from else ())]
+    if not words:
+        raise ConfigError("no SOURCES are given. Name recordings, or use --sources-from FILE.")
+    return find_recordings(words, lambda note: console.print(f"batch: {note}"))
 
 
 def _executor(
@@ -279,7 +294,7 @@ class _Progress:
         what = {"done": f"done{spent}", "kept": "kept from an earlier call"}
         text = what.get(outcome.status, f"{outcome.status}: {outcome.error}")
         line = f"{self._done} of {self._total}: {outcome.name} {text}{self._left()}"
-        self._console.print(line, soft_wrap=True)
+        self._console.print(line)
 
     def _left(self) -> str:
         if not 0 < self._finished < self._all:

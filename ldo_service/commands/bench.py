@@ -23,7 +23,16 @@ from ldo_service.kernels.gpu.benchmark_result import BenchmarkResult, result_fil
 from ldo_service.kernels.gpu.device import MIN_CAPABILITY, Gpu, find_gpu
 from ldo_service.runs.map_benchmark import HeldOutErrors, MapMeasurement, TrackedSource
 
-from .options import ConfigFile, Settings, Source, argument, progress, with_device
+from .options import (
+    ConfigFile,
+    Settings,
+    Source,
+    argument,
+    image_size,
+    note_console,
+    progress,
+    with_device,
+)
 
 Json = Annotated[bool, argument(name="json", help="print one JSON object")]
 
@@ -134,7 +143,7 @@ def bench_render(verb: BenchRender, device: str = "cpu") -> None:
         ConfigError: A number is out of range.
         DeviceError: The device is cuda, but no GPU is available, or its results are wrong.
     """
-    width, height = _pixels(verb.size)
+    width, height = image_size(verb.size)
     cores = os.cpu_count() or 1
     threads = (cores if device == "cuda" else 1) if verb.threads is None else verb.threads
     if not min(verb.gaussians, threads, verb.repeats) >= 1:
@@ -264,7 +273,7 @@ def bench_map(verb: BenchMap, device: str = "cpu") -> None:
     sequence, mapper = open_sequence(verb.source), actor_parameters(config).mapper
     with tempfile.TemporaryDirectory() as temporary:
         runs = (verb.runs or Path(temporary)).expanduser()
-        with progress("track", min(verb.frames, len(sequence)), Console(stderr=True)) as advance:
+        with progress("track", min(verb.frames, len(sequence)), note_console()) as advance:
             tracked = TrackedSource.record(sequence, verb.frames, config, runs, advance)
         found = tracked.measure(mapper.builder, mapper.iterations, verb.refine_iterations)
     if baseline:
@@ -369,17 +378,6 @@ def _facts(found: MapMeasurement, baseline: MapMeasurement | None) -> dict[str, 
         facts["cpu_ratio"] = found.cpu_ms["all"] / baseline.cpu_ms["all"]
         facts["psnr_gain_db"] = found.online.mean_psnr_db - baseline.online.mean_psnr_db
     return facts
-
-
-def _pixels(size: str) -> tuple[int, int]:
-    width, _, height = size.partition("x")
-    if not (width.isdecimal() and height.isdecimal() and 1 <= int(width) <= 8192 >= int(height)):
-        raise ConfigError(
-            f"--size {size}: must be WIDTHxHEIGHT, each from 1 to 8192 pixels, such as 640x480."
-        )
-    if int(height) < 1:
-        raise ConfigError(f"--size {size}: must be at least one pixel high.")
-    return int(width), int(height)
 
 
 def _table(times: dict[str, float]) -> Table:

@@ -11,11 +11,11 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 
-import tyro
 from rich.console import Console
 
-from ldo_service.errors import ConfigError, LdoError
+from ldo_service.errors import ConfigError, LdoError, did_you_mean
 
+from .arguments import parse
 from .log_format import OneLineFormatter
 
 # Verbs that keep their partial results when they are interrupted.
@@ -72,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if not words or words[0] in ("-h", "--help"):
             print(HELP.format(verbs="\n".join(first_lines())))
             sys.exit(0 if words else 2)
-        _run_verb(words, known)
+        parse(_verb(words[0], known), words[0], words[1:])()
     except LdoError as error:
         if debug:
             raise
@@ -86,12 +86,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _run_verb(words: Sequence[str], known: dict[str, Callable[..., None]]) -> None:
-    config = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
-    if words[0] in known:  # `prog` makes errors name the help of the verb.
-        tyro.cli(known[words[0]], prog=f"ldo {words[0]}", args=words[1:], config=config)
-    else:
-        tyro.extras.subcommand_cli_from_dict(known, prog="ldo", args=words, config=config)
+def _verb(name: str, known: dict[str, Callable[..., None]]) -> Callable[..., None]:
+    """Return the function of a verb.
+
+    Raises:
+        ConfigError: There is no verb with this name.
+    """
+    if name not in known:
+        hint = did_you_mean(name, known, "`ldo --help` lists all commands.")
+        raise ConfigError(f"there is no command {name!r}. {hint}")
+    return known[name]
 
 
 def _end_on_interrupts() -> None:

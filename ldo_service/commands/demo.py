@@ -21,8 +21,8 @@ from ldo_service.schemas import MapObjects
 from ldo_service.synthetic import FlatSequence
 from ldo_service.synthetic.flat.sequence import prerender
 
-from .options import Overwrite, argument, progress
-from .run import with_options
+from .options import Overwrite, argument, note_console, progress
+from .run import execute, with_options
 
 FRAMES = 70  # The first frames of the synthetic flat, which show its first room.
 HOLD_OUT = 5  # Every 5th frame is tracked but not mapped.
@@ -46,14 +46,13 @@ def demo(
     other synthetic rooms and recognize objects in synthetic rooms only. The settings that separate
     objects by depth were tuned on this room.
     """
-    console = Console(stderr=True)
+    console = note_console()
     sequence = FlatSequence.named("flat")
     prepare(out, overwrite)
     with progress("ray casting", FRAMES, console) as advance:
         prerender(sequence.config, min(os.cpu_count() or 1, PROCESSES), range(FRAMES), advance)
     job = RunOptions(sequence, out, demo_config(), Selection(max_frames=FRAMES), console.print)
-    with progress("tracking and mapping", job.work, console) as advance:
-        record = run_offline(job, advance)
+    record = execute(job, run_offline, console, "tracking and mapping")
     run, threads = read_run(out), actor_parameters(job.config).mapper.thread_count()
     with progress("evaluating", work(run, sequence), console) as advance:
         results = evaluate_run(run, sequence, advance, threads=threads)
@@ -61,7 +60,7 @@ def demo(
     size = f"{sequence.camera.width}x{sequence.camera.height}"
     for row in rows(record.summary, size, results, read_objects(out)):
         printed.add_row(*row)
-    Console(highlight=False).print(printed)
+    Console(highlight=False, markup=False).print(printed)
 
 
 def demo_config() -> Config:

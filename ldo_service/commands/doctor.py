@@ -19,7 +19,13 @@ from ldo_service.actors.topology import GRAPH
 from ldo_service.client import connect
 from ldo_service.detection.model_registry import Models
 from ldo_service.detection.onnx_network import CUDA, providers_of
-from ldo_service.errors import ConfigError, DeviceError, ModelError, install_command
+from ldo_service.errors import (
+    ConfigError,
+    DeviceError,
+    ModelError,
+    UnavailableError,
+    install_command,
+)
 from ldo_service.gaussians import GaussianOptimizerConfig
 from ldo_service.gaussians.device_choice import choose_backend
 from ldo_service.kernels.gpu.benchmark_result import COMMAND
@@ -257,10 +263,10 @@ def service(
     try:
         actors, heard = seen(robot, endpoint, keys, window_s)
     except ConfigError as error:
-        if keys is not None:
-            yield Finding("bad", str(error))
-        else:
+        if keys is None and isinstance(error, UnavailableError):
             yield Finding("absent", f"no service on {endpoint}: `ldo serve` starts one")
+        else:
+            yield Finding("bad", str(error))
         return
     if not any(actor.has_token or actor.health for actor in actors):
         yield Finding(
@@ -321,7 +327,7 @@ def seen(
                 heard.setdefault(health.actor, []).append((time.monotonic(), health))
             time.sleep(0.05)
         alive, now_s = client.live_actors(), time.monotonic()
-    names = [box.name for box in GRAPH]
+    names = [spec.name for spec in GRAPH]
     names += sorted((set(heard) | alive) - set(names))  # Actors of a later version.
     actors = [
         ActorStatus(name, name in alive, None, window_s)

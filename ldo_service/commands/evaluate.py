@@ -28,7 +28,7 @@ from ldo_service.geometry.sequence import OdometryAsTruth
 from ldo_service.runs.finished import read_run, require_file
 from ldo_service.runs.networks import labelled_by
 
-from .options import Json, Source, argument, progress
+from .options import Json, Source, argument, note_console, progress
 
 FIGURES = {
     "mIoU": "mean_iou",
@@ -163,7 +163,7 @@ def evaluate(
         if sequence.odometry() is None:
             raise DataError(f"{source} contains no odometry. Remove --odometry-as-truth.")
         sequence = OdometryAsTruth(sequence)
-    with progress("eval", work(run, sequence), Console(stderr=True)) as advance:
+    with progress("eval", work(run, sequence), note_console()) as advance:
         results = evaluate_run(
             run, sequence, advance, distance=distance, threads=threads, classes=listed
         )
@@ -194,7 +194,8 @@ def print_results(
         config: Configuration of the run.
         has_protocol: True to print the definition of the metrics above each table.
     """
-    console = Console(highlight=False, width=None if sys.stdout.isatty() else WIDTH)
+    width = None if sys.stdout.isatty() else WIDTH
+    console = Console(highlight=False, markup=False, width=width)
 
     def explain(definitions: str) -> None:
         if has_protocol:

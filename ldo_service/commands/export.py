@@ -11,7 +11,7 @@ from ldo_service.runs.export import ExportFormat, Up, export_map
 from ldo_service.runs.finished import MapFolder, newest_map
 from ldo_service.runs.folder import EXPORTED
 
-from .options import argument, progress
+from .options import argument, note_console, progress
 
 
 def export(
@@ -56,7 +56,7 @@ def export(
     """
     source = MapFolder(folder) if online else newest_map(folder)
     out = out or folder / EXPORTED[format][0]
-    console = Console(stderr=True, highlight=False)
+    console = note_console()
     # Formats without keyframes finish immediately and show no progress.
     has_progress = format in ("mesh", "occupancy")
     with progress(format, 1, console) if has_progress else nullcontext(_no_progress) as advance:
@@ -71,7 +71,7 @@ def export(
             overwrite=overwrite,
             advance=advance,
         )
-    Console(highlight=False).print(f"{out}: {facts}", soft_wrap=True)
+    Console(highlight=False, markup=False).print(f"{out}: {facts}", soft_wrap=True)
 
 
 def _no_progress(_done: int, _total: int | None = None, /) -> None:

@@ -17,7 +17,7 @@ from ldo_service.schemas import CameraRgbd
 from ldo_service.transport.endpoint import Endpoint
 from ldo_service.transport.zenoh_transport import open_session
 
-from .options import argument
+from .options import argument, image_size
 
 REALSENSE, ROS2 = "realsense", "ros2"
 Notify = Callable[[str], None]
@@ -40,14 +40,10 @@ class RealSenseOptions:
         Raises:
             ConfigError: The size or the rate is invalid.
         """
-        width, _, height = self.size.partition("x")
-        if not (width.isdecimal() and height.isdecimal()):
-            raise ConfigError(
-                f"--size {self.size} must be WIDTHxHEIGHT in pixels, such as 640x480."
-            )
+        width, height = image_size(self.size)
         if self.fps <= 0:
             raise ConfigError(f"--fps {self.fps} must be a positive rate in Hz, such as 30.")
-        return RealSenseStream(self.serial, int(width), int(height), self.fps)
+        return RealSenseStream(self.serial, width, height, self.fps)
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,13 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ldo_service.config import Config, checked, known_presets
+from ldo_service.errors import ConfigError
 from ldo_service.runs.job import Advance
 from ldo_service.synthetic import SCENES
 from ldo_service.tracking.localizer import load_keyframe_database
 
 NO_DEFAULTS = ("None", "False", "", "''")  # Default values that the help does not print.
+MAX_SIDE_PX = 8192  # Maximum width and height of --size.
 LINES = 10  # Lines of progress per command if the output is no terminal.
 
 
@@ -172,6 +174,26 @@ def localizing(config: Config, folder: Path | None) -> Config:
     load_keyframe_database(folder)
     tracker = replace(config.tracker, localization_map=str(folder))
     return replace(config, tracker=tracker)
+
+
+def image_size(text: str) -> tuple[int, int]:
+    """Return width and height, pixels, from the text WIDTHxHEIGHT of --size.
+
+    Raises:
+        ConfigError: The text has another form, or a side is out of range.
+    """
+    sides = text.split("x")
+    if len(sides) != 2 or not all(s.isdecimal() and 1 <= int(s) <= MAX_SIDE_PX for s in sides):
+        raise ConfigError(
+            f"--size {text} must be WIDTHxHEIGHT, each from 1 to {MAX_SIDE_PX} pixels, such as "
+            "640x480."
+        )
+    return int(sides[0]), int(sides[1])
+
+
+def note_console() -> Console:
+    """Return a console for notes and progress, whose text may contain paths with brackets."""
+    return Console(stderr=True, highlight=False, markup=False, soft_wrap=True)
 
 
 @contextmanager

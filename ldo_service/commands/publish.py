@@ -40,6 +40,7 @@ from .options import (
     Stride,
     Topics,
     argument,
+    note_console,
     progress,
     with_topics,
 )
@@ -48,26 +49,31 @@ FIRST_REALSENSE, NO_TOPICS = RealSenseOptions(), RosOptions()
 MAX_BAD = 0.1  # The command fails if more than this fraction of the frames cannot be read.
 
 
+PublishSource = Annotated[
+    str,
+    tyro.conf.Positional,
+    argument(metavar="SOURCE", help="a data set, as for `ldo run`; `realsense`; or `ros2`"),
+]
+Rate = Annotated[
+    float | None, argument(metavar="HZ", help="frames per second; default: as recorded")
+]
+Restamp = Annotated[
+    bool,
+    argument(
+        help="replace each stamp by the time of sending, for example to send a data set again"
+    ),
+]
+
+
 def publish(
-    source: Annotated[
-        str,
-        tyro.conf.Positional,
-        argument(metavar="SOURCE", help="a data set, as for `ldo run`; `realsense`; or `ros2`"),
-    ],
+    source: PublishSource,
     robot: Robot = "robot",
     endpoint: EndpointAddress = DEFAULT_ENDPOINT,
     keys: KeysFolder = None,
-    rate: Annotated[
-        float | None, argument(metavar="HZ", help="frames per second; default: as recorded")
-    ] = None,
+    rate: Rate = None,
     stride: Stride = 1,
     max_frames: MaxFrames = None,
-    restamp: Annotated[
-        bool,
-        argument(
-            help="replace each stamp by the time of sending, for example to send a data set again"
-        ),
-    ] = False,
+    restamp: Restamp = False,
     config: ConfigFile = None,
     set: Settings = (),
     topic: Topics = (),
@@ -90,7 +96,7 @@ def publish(
       ldo publish realsense --size 848x480
       ldo publish ros2 --color /camera/color/image_raw --depth /camera/aligned_depth/image_raw
     """
-    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    console = note_console()
     selection = Selection(stride, max_frames)
     if source in (REALSENSE, ROS2):
         require_no_sequence(

@@ -12,7 +12,7 @@ from rich.table import Table
 from ldo_service.recordings.replay import ReplayReport
 from ldo_service.runs.replayed import RecordedActor, open_recording
 
-from .options import Recording, argument, progress
+from .options import Recording, argument, note_console, progress
 
 
 def replay(
@@ -32,10 +32,10 @@ def replay(
 
       ldo replay recordings/desk --verify
     """
-    console = Console(stderr=True, highlight=False)
+    console = note_console()
     actors = open_recording(recording, tuple(actor))
     for caveat in dict.fromkeys(line for recorded in actors for line in recorded.caveats()):
-        console.print(f"note: {caveat}", soft_wrap=True)
+        console.print(f"note: {caveat}")
     with progress("replay", sum(recorded.steps for recorded in actors), console) as advance:
         step = map(advance, itertools.count(1))
         replayed = [_replay(recorded, verify, console, lambda: next(step)) for recorded in actors]
@@ -47,11 +47,11 @@ def _replay(
 ) -> ReplayReport:
     replayed = recorded.replay(advance)
     for note in replayed.notes:
-        console.print(f"note: {note}", soft_wrap=True)
+        console.print(f"note: {note}")
     if verify:
         replayed.verify()
     elif replayed.difference:
-        console.print(f"{replayed.difference}", soft_wrap=True)
+        console.print(f"{replayed.difference}")
     return replayed
 
 

@@ -36,6 +36,7 @@ from .options import (
     Topics,
     argument,
     localizing,
+    note_console,
     progress,
     with_device,
     with_preset,
@@ -53,9 +54,51 @@ EXCLUSIVE = {
 }
 
 
+Out = Annotated[Path, argument(metavar="DIR", help="folder for the results")]
+Threads = Annotated[
+    int | None,
+    argument(
+        metavar="T",
+        help="threads of the renderer; 0: all cores, or with --realtime all but one, which the "
+        "tracker uses",
+    ),
+]
+RefineIterations = Annotated[
+    int,
+    argument(
+        metavar="N",
+        help="optimize the map for N more iterations at the end, saved in DIR/refined",
+    ),
+]
+OdometryPrior = Annotated[
+    Path | None,
+    argument(
+        metavar="FILE",
+        help="poses of the robot's base from another odometry, in the TUM format, as initial "
+        "guess for the tracker; tracker.T_base_camera must be the camera pose relative to the "
+        "base",
+    ),
+]
+KeepFrontEnd = Annotated[
+    bool,
+    argument(help="record the outputs of tracker and detector, with images, in DIR/front_end.mcap"),
+]
+ReuseFrontEnd = Annotated[
+    Path | None,
+    argument(
+        metavar="RUN",
+        help="use the recorded outputs of tracker and detector of an earlier RUN over the same "
+        "frames, to compare settings of the other actors on equal poses",
+    ),
+]
+Realtime = Annotated[
+    bool, argument(help="send frames at the times of their stamps, and drop late ones")
+]
+
+
 def run(
     source: Source,
-    out: Annotated[Path, argument(metavar="DIR", help="folder for the results")],
+    out: Out,
     preset: Preset = "",
     config: ConfigFile = None,
     set: Settings = (),
@@ -64,49 +107,14 @@ def run(
     max_frames: MaxFrames = None,
     stride: Stride = 1,
     hold_out_every: HoldOutEvery = None,
-    threads: Annotated[
-        int | None,
-        argument(
-            metavar="T",
-            help="threads of the renderer; 0: all cores, or with --realtime all but one, which the "
-            "tracker uses",
-        ),
-    ] = None,
-    refine_iterations: Annotated[
-        int,
-        argument(
-            metavar="N",
-            help="optimize the map for N more iterations at the end, saved in DIR/refined",
-        ),
-    ] = 0,
+    threads: Threads = None,
+    refine_iterations: RefineIterations = 0,
     localize: Localize = None,
-    odometry_prior: Annotated[
-        Path | None,
-        argument(
-            metavar="FILE",
-            help="poses of the robot's base from another odometry, in the TUM format, as initial "
-            "guess for the tracker; tracker.T_base_camera must be the camera pose relative to the "
-            "base",
-        ),
-    ] = None,
-    keep_front_end: Annotated[
-        bool,
-        argument(
-            help="record the outputs of tracker and detector, with images, in DIR/front_end.mcap"
-        ),
-    ] = False,
-    reuse_front_end: Annotated[
-        Path | None,
-        argument(
-            metavar="RUN",
-            help="use the recorded outputs of tracker and detector of an earlier RUN over the same "
-            "frames, to compare settings of the other actors on equal poses",
-        ),
-    ] = None,
+    odometry_prior: OdometryPrior = None,
+    keep_front_end: KeepFrontEnd = False,
+    reuse_front_end: ReuseFrontEnd = None,
     device: Device = None,
-    realtime: Annotated[
-        bool, argument(help="send frames at the times of their stamps, and drop late ones")
-    ] = False,
+    realtime: Realtime = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Track and map a sequence; write trajectory, map and metrics to a folder.
@@ -133,15 +141,9 @@ def run(
         }
     )
     require_separate(localize, out, refine_iterations)
-    console = Console(stderr=True)
-    settings = localizing(
-        with_options(
-            load_config(config, with_topics(with_preset(set, preset), topic)),
-            hold_out_every,
-            threads,
-        ),
-        localize,
-    )
+    console = note_console()
+    loaded = load_config(config, with_topics(with_preset(set, preset), topic))
+    settings = localizing(with_options(loaded, hold_out_every, threads), localize)
     settings = with_device(settings, device)
     require_usable_networks(settings)
     selection = Selection(stride, max_frames)
@@ -149,8 +151,7 @@ def run(
     sequence = open_sequence(source, settings.dataset.options())
     prior = Trajectory.load(odometry_prior) if odometry_prior else None
     if recorded_odometry:
-        indices = selection.indices(sequence)
-        prior = recorded_prior(sequence, indices, settings, console.print)
+        prior = recorded_prior(sequence, selection.indices(sequence), settings, console.print)
     job = RunOptions(
         *(sequence, out, settings, selection, console.print),
         refine=refine_iterations,
@@ -165,7 +166,7 @@ def run(
 
 def print_results(record: RunWriter, out: Path, localize: Path | None) -> None:
     """Print the summary of a finished run, with notes on unmerged submaps and on localization."""
-    console = Console()
+    console = Console(markup=False)
     console.print(summary_table(record.summary, out))
     if record.summary["gaussians_unmerged"]:
         console.print(format_unmerged(record.summary["gaussians_unmerged"]), style="dim")
@@ -174,7 +175,10 @@ def print_results(record: RunWriter, out: Path, localize: Path | None) -> None:
 
 
 def execute(
-    job: RunOptions, go: Callable[[RunOptions, Advance], RunWriter], console: Console
+    job: RunOptions,
+    go: Callable[[RunOptions, Advance], RunWriter],
+    console: Console,
+    title: str = "run",
 ) -> RunWriter:
     """Run a job with a progress bar.
 
@@ -182,11 +186,12 @@ def execute(
         job: Sequence, folder and options of the run.
         go: Function that runs the job: `run_offline` or `run_realtime`.
         console: Console of the progress bar.
+        title: Title of the progress bar.
 
     Raises:
         ConfigError: The folder of the run cannot be written.
     """
-    with progress("run", job.work, console) as advance:
+    with progress(title, job.work, console) as advance:
         try:
             return go(job, advance)
         except OSError as error:

@@ -24,6 +24,7 @@ from .options import (
     Stride,
     Topics,
     argument,
+    note_console,
     progress,
     with_preset,
     with_topics,
@@ -53,7 +54,7 @@ def simulate(
 
       ldo simulate synthetic:room --max-frames 60 --json
     """
-    console = Console(stderr=True, highlight=False)
+    console = note_console()
     settings = with_options(
         load_config(config, with_topics(with_preset(set, preset), topic)),
         hold_out=None,

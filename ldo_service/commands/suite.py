@@ -5,43 +5,47 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.evaluation.lpips import Lpips
 from ldo_service.suites import SuiteRun, SuiteRunner, load_suite, markdown
 
-from .options import Overwrite, Settings, argument
+from .options import Overwrite, Settings, argument, note_console
 
 TABLE = "table.md"
 
 
+SuiteName = Annotated[
+    str,
+    tyro.conf.Positional,
+    argument(metavar="SUITE", help="YAML file, or the name of a built-in suite"),
+]
+Out = Annotated[Path, argument(metavar="DIR", help="folder for the runs and the tables")]
+Data = Annotated[Path, argument(metavar="DIR", help="folder with the data sets of the suite")]
+Workers = Annotated[
+    int,
+    argument(
+        metavar="N",
+        help="runs at the same time; with more than one, the times of the tables depend on the "
+        "load",
+    ),
+]
+LpipsFile = Annotated[
+    Path | None,
+    argument(
+        metavar="FILE.onnx",
+        help="network of LPIPS, as for `ldo eval`; without it, the tables have no LPIPS",
+    ),
+]
+
+
 def suite(
-    name: Annotated[
-        str,
-        tyro.conf.Positional,
-        argument(metavar="SUITE", help="YAML file, or the name of a built-in suite"),
-    ],
-    out: Annotated[Path, argument(metavar="DIR", help="folder for the runs and the tables")],
-    data: Annotated[
-        Path, argument(metavar="DIR", help="folder with the data sets of the suite")
-    ] = Path(),
+    name: SuiteName,
+    out: Out,
+    data: Data = Path(),
     set: Settings = (),
-    workers: Annotated[
-        int,
-        argument(
-            metavar="N",
-            help="runs at the same time; with more than one, the times of the tables depend on "
-            "the load",
-        ),
-    ] = 1,
-    lpips: Annotated[
-        Path | None,
-        argument(
-            metavar="FILE.onnx",
-            help="network of LPIPS, as for `ldo eval`; without it, the tables have no LPIPS",
-        ),
-    ] = None,
+    workers: Workers = 1,
+    lpips: LpipsFile = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Run and evaluate several sequences and variants, and print tables of their metrics.
@@ -65,12 +69,12 @@ def suite(
     folders = data.expanduser(), out.expanduser()
     work = SuiteRunner(chosen, *folders, set, overwrite, workers, lpips)
     _require_folder(work.out)
-    console, total = Console(stderr=True), len(work.entries())
+    console, total = note_console(), len(work.entries())
     done: list[SuiteRun] = []
 
     def begun(entry: SuiteRun) -> None:
         done.append(entry)
-        console.print(f"{len(done)} of {total}: {entry.folder}", highlight=False)
+        console.print(f"{len(done)} of {total}: {entry.folder}")
 
     outcomes = list(work.outcomes(begun))
     if all(outcome.missing == "no data" for outcome in outcomes):
@@ -78,13 +82,7 @@ def suite(
             f"{work.data} has none of the sequences of {name}. Give their folder with --data."
         )
     table = markdown(chosen, outcomes, has_lpips=lpips is not None)
-    try:
-        (work.out / TABLE).write_text(table)
-    except OSError as error:
-        raise ConfigError(
-            f"{work.out / TABLE} cannot be written: {error.strerror}. Free some disk space or make "
-            f"{work.out} writable, and repeat the command: finished runs are kept."
-        ) from error
+    _save(work.out / TABLE, table)
     print(table, end="")
     if any(outcome.missing == "failed" for outcome in outcomes):
         sys.exit(1)
@@ -101,4 +99,19 @@ def _require_folder(folder: Path) -> None:
     except OSError as error:
         raise ConfigError(
             f"{folder} cannot be written: {error.strerror}. Choose another --out."
+        ) from error
+
+
+def _save(path: Path, table: str) -> None:
+    """Write the tables to a file.
+
+    Raises:
+        ConfigError: The file cannot be written.
+    """
+    try:
+        path.write_text(table)
+    except OSError as error:
+        raise ConfigError(
+            f"{path} cannot be written: {error.strerror}. Free some disk space or make "
+            f"{path.parent} writable, and repeat the command: finished runs are kept."
         ) from error

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
 from ldo_service.client import connect
 from ldo_service.config import load_config
@@ -19,7 +18,15 @@ from ldo_service.viewer.run_folder import RunFolder
 from ldo_service.viewer.scene import Source
 from ldo_service.viewer.view_config import ViewerConfig, viewer_config
 
-from .options import ConfigFile, EndpointAddress, KeysFolder, Robot, Settings, argument
+from .options import (
+    ConfigFile,
+    EndpointAddress,
+    KeysFolder,
+    Robot,
+    Settings,
+    argument,
+    note_console,
+)
 from .query import LIVE
 
 
@@ -90,7 +97,7 @@ def serve_window(source: Source, config: ViewerConfig, title: str) -> None:
     from ldo_service.viewer.window import open_window  # Viser is an optional extra.
 
     with open_window(source, config, title) as window:
-        Console(stderr=True, highlight=False).print(f"{title} on {window.url}")
+        note_console().print(f"{title} on {window.url}")
         while True:
             window.show(source.update(is_watched=window.is_watched))
             time.sleep(config.update_s)

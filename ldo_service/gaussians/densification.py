@@ -173,8 +173,6 @@ def densify(
     """
     config = config or DensificationConfig()
     T_camera_map = se3.inverse(T_map_camera)
-
-    # Find the unexplained pixels.
     before = before or render(
         gaussians.rows,
         frame.camera,
@@ -185,12 +183,29 @@ def densify(
     )
     if ignore_mask is not None:
         frame = _without(frame, ignore_mask, before)
+    cells, rows = _cells_and_surfels(frame, T_map_camera, before, ignore_mask, config)
+    ids = gaussians.add(rows, keyframe)
+    rasterizer = Rasterizer(threads=threads, memory=memory)
+    _fit_colors(gaussians, cells, frame, T_camera_map, rasterizer, config)
+    return ids
+
+
+def _cells_and_surfels(
+    frame: RgbdFrame,
+    T_map_camera: np.ndarray,
+    before: Rendering,
+    ignore_mask: np.ndarray | None,
+    config: DensificationConfig,
+) -> tuple[QuadtreeCells, np.ndarray]:
+    """Return the cells of the surface that the map lacks, and a new Gaussian for each cell.
+
+    Returns:
+        M cells, and the rows [M, 16] of their Gaussians.
+    """
     depth_m = with_small_holes_filled(frame.depth_m, config.hole_px)
     wanted = densification_mask(frame, before, config) & (depth_m > 0)
     if ignore_mask is not None:
         wanted &= ~ignore_mask
-
-    # Add one Gaussian per cell.
     cells = quadtree(
         frame.color,
         depth_m,
@@ -210,19 +225,37 @@ def densify(
         max_stretch=config.max_stretch,
         opacity=config.opacity,
     )
-    ids = gaussians.add(rows, keyframe)
+    return cells, rows
 
-    # Correct the colors, because overlapping neighbors blur them.
-    new_colors = gaussians.colors[len(gaussians) - len(ids) :]
-    rasterizer, tiles = Rasterizer(threads=threads, memory=memory), tiles_of(cells, *wanted.shape)
+
+def _fit_colors(
+    gaussians: GaussianMap,
+    cells: QuadtreeCells,
+    frame: RgbdFrame,
+    T_camera_map: np.ndarray,
+    rasterizer: Rasterizer,
+    config: DensificationConfig,
+) -> None:
+    """Correct the colors of the newest Gaussians, because overlapping neighbors blur them.
+
+    Args:
+        gaussians: The map; its last Gaussians are those of the cells.
+        cells: The cells.
+        frame: The keyframe.
+        T_camera_map: Transform from the map to the camera, [4, 4].
+        rasterizer: Renderer of the map.
+        config: Settings.
+    """
+    newest = slice(len(gaussians) - len(cells), None)
+    new_colors = gaussians.colors[newest]
+    tiles = tiles_of(cells, *frame.depth_m.shape)
     for _ in range(config.color_steps):
         planes = rasterizer.render(
             gaussians.rows, frame.camera, T_camera_map, bounds=gaussians.bounds, tiles=tiles
         )
         shown = np.asarray(cv2.merge([*planes[:3]]))
         correct_colors(new_colors, cells, frame, shown, config.max_color_step)
-        gaussians.touch(slice(len(gaussians) - len(ids), None))
-    return ids
+        gaussians.touch(newest)
 
 
 def tiles_of(cells: QuadtreeCells, height: int, width: int) -> np.ndarray:

@@ -22,8 +22,8 @@ from .visibility import BLOCKS, MaxDepthGrid, PlacedCamera
 log = logging.getLogger(__name__)
 
 _DISK_FULL = (
-    "Images of new keyframes stay only in memory, up to cache_mb, and are then dropped. To keep "
-    "them, free some disk space or lower quota_mb."
+    "Images of new keyframes stay only in memory, up to mapper.keyframe_images.memory_mb, and are "
+    "then dropped. To keep them, free some disk space or lower mapper.keyframe_images.disk_mb."
 )
 
 

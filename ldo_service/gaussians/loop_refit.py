@@ -124,8 +124,8 @@ class LoopRefit:
 
     def _forget(self) -> None:
         """Drop keyframes without pending iterations or without images."""
-        known = self._map.views.cameras
-        self._pending = {k: left for k, left in self._pending.items() if left > 0 and k in known}
+        stored = self._map.views.store  # Unlike `views.cameras`, it lacks unreadable keyframes.
+        self._pending = {k: left for k, left in self._pending.items() if left > 0 and k in stored}
 
     @property
     def pending_iterations(self) -> int:

@@ -57,7 +57,7 @@ class OffloadedGaussians:
         self.retired = RetiredFiles(self.files)
         self._spheres: BoundingSpheres | None = None  # Cache; None after a change of the entries.
         self._lost: list[LostIdRange] = []  # Ranges that `pop_lost_ids` will return.
-        self._slept = self._awoken = self._damaged = 0
+        self._offloaded_total = self._loaded_total = self._damaged = 0
 
     def __len__(self) -> int:
         """Return the number of offloaded Gaussians."""
@@ -102,7 +102,7 @@ class OffloadedGaussians:
         """
         chunk = self._read(number)
         if number in self._entries:  # Reading removes a damaged chunk.
-            self._awoken += self._entries[number].count
+            self._loaded_total += self._entries[number].count
             self._retire(number)
         return chunk
 
@@ -278,8 +278,8 @@ class OffloadedGaussians:
             "gaussians_offloaded": len(self),
             "chunks_offloaded": len(self._entries),
             "gaussians_disk_mb": sum(self.files.sizes.values()) / 1e6,
-            "gaussians_offloaded_total": self._slept,
-            "gaussians_loaded_total": self._awoken,
+            "gaussians_offloaded_total": self._offloaded_total,
+            "gaussians_loaded_total": self._loaded_total,
             "gaussians_lost_on_disk": self._damaged,
             "chunks_not_written": self.files.not_written,
         }
@@ -292,7 +292,7 @@ class OffloadedGaussians:
         self._entries[number] = entry
         self._next_number += 1
         self._spheres = None
-        self._slept += entry.count
+        self._offloaded_total += entry.count
         return number
 
     def _read(self, number: int) -> Chunk:
@@ -318,7 +318,7 @@ class OffloadedGaussians:
         """Write a chunk again at the current pose of its anchor, so that no motions are pending."""
         chunk, entry = self._read(number), self._entries.get(number)
         if entry is not None and self._write(chunk, replace(entry, motions=())) is not None:
-            self._slept -= entry.count
+            self._offloaded_total -= entry.count
             self._retire(number)
 
     def _lose(self, number: int, reason: str) -> None:

@@ -17,7 +17,6 @@ from ldo_service.kernels import _rasterize
 from .rows import ROW, aligned_rows
 
 PLANES = 5  # Red, green, blue, weighted depth, opacity.
-WEIGHT = 14  # Column of the summed blending weight in a row of gradients.
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -59,7 +59,7 @@ class _RealTimeRun:
 
     async def go(self) -> RunWriter:
         transport = MemoryTransport()
-        stages = [self._stage(box, transport) for box in finish_order(GRAPH)]
+        stages = [self._stage(spec, transport) for spec in finish_order(GRAPH)]
         for topic in _made_topics():
             self._observe(topic, transport)
         stop = StopRequest()
@@ -74,8 +74,8 @@ class _RealTimeRun:
         used = Usage.now().since(started)
         return self._close(used, [stage.health() for stage in stages])
 
-    def _stage(self, box: ActorSpec, transport: MemoryTransport) -> Stage:
-        make = box.make
+    def _stage(self, spec: ActorSpec, transport: MemoryTransport) -> Stage:
+        make = spec.make
         assert make is not None
         parameters = actor_parameters(self._config)
         return Stage(
@@ -83,10 +83,11 @@ class _RealTimeRun:
             transport,
             config=stage_parameters(self._config),
             expected={
-                out.topic.name: lossless_consumers(GRAPH, out.topic.name) for out in box.outputs
+                out.topic.name: lossless_consumers(GRAPH, out.topic.name) for out in spec.outputs
             },
             with_backlog={
-                out.topic.name: consumers_with_backlog(GRAPH, out.topic.name) for out in box.outputs
+                out.topic.name: consumers_with_backlog(GRAPH, out.topic.name)
+                for out in spec.outputs
             },
         )
 
@@ -133,4 +134,4 @@ class _RealTimeRun:
 
 
 def _made_topics() -> list[Topic]:
-    return [out.topic for box in GRAPH for out in box.outputs]
+    return [out.topic for spec in GRAPH for out in spec.outputs]

@@ -149,7 +149,7 @@ def _is_recording(path: Path) -> bool:
 
     Other .mcap files are bags of ROS.
     """
-    return any(box.name in recorded_actors(path) for box in GRAPH)
+    return any(spec.name in recorded_actors(path) for spec in GRAPH)
 
 
 # Registered as an entry point of the group `ldo.sequences`, because `datasets` may not import the

@@ -214,9 +214,8 @@ class Actor:
         """Yield the final messages of the actor.
 
         On a soft stop, the actor first handles all queued messages. Then the stage calls this
-        method.
-        The actors stop in the order of `actor_graph.finish_order`. Only messages of ports with
-        `is_final` are allowed.
+        method. The actors stop in the order of `actor_graph.finish_order`. Only messages of ports
+        with `is_final` are allowed.
         """
         return iter(())
 

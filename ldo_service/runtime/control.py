@@ -81,7 +81,7 @@ class Control:
         """
         self._generations = generations
         self._reset_marker, self._pause_marker = reset_marker, pause_marker
-        self._commander = CommandSender(transport)
+        self._sender = CommandSender(transport)
         self._actors, self._sources = tuple(actors), tuple(sources)
         self._saved_where, self._timeout_s = saved_where, timeout_s
         self._is_paused = pause_marker is not None and pause_marker.exists()
@@ -127,7 +127,7 @@ class Control:
         """Close the publisher of commands."""
         for task in self._tasks:
             task.cancel()
-        self._commander.close()
+        self._sender.close()
 
     # --- verbs ------------------------------------------------------------------------------------
     async def _pause(self) -> str:
@@ -289,7 +289,7 @@ class Control:
         failures, until_s = [], time.monotonic() + self._timeout_s
         for actor in actors:
             within_s = max(until_s - time.monotonic(), min(MIN_S, self._timeout_s))
-            error = await self._commander.order(what, actor, within_s)
+            error = await self._sender.send(what, actor, within_s)
             failures += [f"{actor} {error}"] if error else []
         if failures:
             advice = "Check the actors with `ldo doctor`, then repeat the command."
@@ -303,10 +303,10 @@ class Control:
         is_source = name in self._sources
         markers = [self._reset_marker, *([self._pause_marker] if is_source else [])]
         if self._is_reset_pending or (is_source and self._is_paused):
-            self._start(self._commander.order("pause", name, self._timeout_s))
+            self._start(self._sender.send("pause", name, self._timeout_s))
         elif any(marker is not None and marker.exists() for marker in markers):
             # The disk did not remove the marker, so the actor has started paused.
-            self._start(self._commander.order("resume", name, self._timeout_s))
+            self._start(self._sender.send("resume", name, self._timeout_s))
 
     def _start(self, work: Coroutine[Any, Any, object]) -> None:
         task = asyncio.ensure_future(work)

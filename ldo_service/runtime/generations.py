@@ -222,15 +222,15 @@ class GenerationKeeper:
     A generation is a synced copy of the states of all actors, to which the service falls back.
     """
 
-    def __init__(self, commander: CommandSender, store: FolderStore, actors: Sequence[str]) -> None:
+    def __init__(self, sender: CommandSender, store: FolderStore, actors: Sequence[str]) -> None:
         """Prepare the task; `run` starts it.
 
         Args:
-            commander: Client of the stages.
+            sender: Client of the stages.
             store: Store of the states.
             actors: Names of the actors in the order of `consumers_first`.
         """
-        self._commander, self._store = commander, store
+        self._sender, self._store = sender, store
         self._actors = tuple(actors)
         self._completed = 0  # Last complete generation.
         self._is_confirmed = False  # True if the disk is certain to have this number.
@@ -303,7 +303,7 @@ class GenerationKeeper:
         number = await asyncio.to_thread(next_generation, self._store)
         for actor in self._actors:
             details = number, self._completed
-            error = await self._commander.order("keep", actor, self._within_s, details)
+            error = await self._sender.send("keep", actor, self._within_s, details)
             if error:
                 self._within_s = min(2 * self._within_s, MAX_KEEP_WITHIN_S)
                 return f"{actor} {error}"
@@ -319,7 +319,7 @@ class GenerationKeeper:
 
     def close(self) -> None:
         """Close the client that sends commands to the stages."""
-        self._commander.close()
+        self._sender.close()
 
     def _read_positions(self) -> list[str]:
         """Return names of files that change with each message on a lossless topic."""

@@ -84,7 +84,7 @@ class Mailbox:
         # True while the stage takes no messages because its state cannot be saved. Producers then
         # do not evict this actor.
         self.waits_for_disk = False
-        self._orders: deque[StageCommand] = deque()
+        self._commands: deque[StageCommand] = deque()
         self._grants: dict[str, Publisher] = {}
         self._malformed = LogLimit(LOG_PERIOD_S)
         self._older: set[str] = set()  # Topics whose producer is of a version without nonces.
@@ -109,10 +109,8 @@ class Mailbox:
             transport.subscribe(
                 producer_hello_key(topic), lambda _, body: self._welcomed(link, body)
             )
-            has_backlog = isinstance(port.policy, Backlog)
-            transport.subscribe(
-                retransmit_key(topic, self._consumer if has_backlog else ""), arrived
-            )
+            own = self._consumer if isinstance(port.policy, Backlog) else ""
+            transport.subscribe(retransmit_key(topic, own), arrived)
         transport.subscribe(data_key(topic), arrived)
 
     # --- arriving, on any thread --------------------------------------------------------------
@@ -142,7 +140,8 @@ class Mailbox:
         if limit is not None and size_bytes > limit:
             return f"its {size_bytes} bytes exceed the {limit} bytes of this topic"
         if size_bytes > self._max_bytes:
-            return f"its {size_bytes} bytes exceed service.max_decoded_message_mb"
+            setting = f"service.max_decoded_message_mb={self._max_bytes / 1e6:g}"
+            return f"its {size_bytes} bytes exceed {setting}. Raise it, or send smaller images"
         return ""
 
     def _reject(self, inlet: Inlet, why: str) -> None:
@@ -248,8 +247,8 @@ class Mailbox:
             with self._lock:
                 self._wake_pending = False
                 self._ready.clear()
-                if self._orders:
-                    return self._orders.popleft()
+                if self._commands:
+                    return self._commands.popleft()
                 if self._order and not self._held:
                     delivery = next((d for d in self._order if d.port.has_priority), self._order[0])
                     self._order.remove(delivery)
@@ -285,20 +284,20 @@ class Mailbox:
                 if isinstance(inlet, LosslessInlet)
             }
 
-    def put_command(self, order: StageCommand) -> list[StageCommand]:
+    def put_command(self, command: StageCommand) -> list[StageCommand]:
         """Queue a command; `take` returns commands before messages.
 
         The command `keep` makes the actor copy its saved state. A new `keep` command replaces the
         queued `keep` commands. An actor that was busy for long then copies its state only once.
 
         Args:
-            order: The command.
+            command: The command.
 
         Returns:
             The replaced commands.
         """
-        replaced = [o for o in self._orders if o.what == order.what == "keep"]
-        self._orders = deque(o for o in [*self._orders, order] if o not in replaced)
+        replaced = [old for old in self._commands if old.what == command.what == "keep"]
+        self._commands = deque(c for c in [*self._commands, command] if c not in replaced)
         self._ready.set()
         return replaced
 

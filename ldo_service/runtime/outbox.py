@@ -1,5 +1,6 @@
 """Outbox of a topic: the messages that at least one lossless consumer has not handled."""
 
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Iterable
 from pathlib import Path
@@ -120,9 +121,10 @@ class Outbox:
 
         Call this method in a thread other than the event loop's, because it may read the disk.
         """
-        with self._lock:
-            if self._memory and self._memory[0].seq <= seq <= self._memory[-1].seq:
-                return self._memory[seq - self._memory[0].seq]
+        with self._lock:  # Numbers ascend, with gaps where a message had no lossless consumer.
+            place = bisect_left(self._memory, seq, key=lambda message: message.seq)
+            if place < len(self._memory) and self._memory[place].seq == seq:
+                return self._memory[place]
         found = self._log.read(seq) if self._log else None
         return UnackedMessage(*found) if found else None
 

@@ -153,9 +153,9 @@ class ChildProcess:
         watch = asyncio.create_task(self._kill_when_silent(), name=f"{self.name} watch")
         try:
             while not self._draining:
-                code = await self._run_once()
+                how = await self._run_once()
                 if not self._draining:
-                    await self._back_off(code)
+                    await self._back_off(how)
         finally:
             watch.cancel()
             self.kill()
@@ -163,10 +163,21 @@ class ChildProcess:
                 await self._process.wait()
             self._own_health.close()
 
-    async def _run_once(self) -> int:
+    async def _run_once(self) -> str:
+        """Run one process, and return how it ended, for the log."""
+        try:
+            code = await self._run_process()
+        except OSError as error:  # The machine may lack memory or file descriptors for a while.
+            return f"cannot be started: {error.strerror or error}"
+        return f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
+
+    async def _run_process(self) -> int:
         """Run one process and return its exit code.
 
         A negative code is the number of the signal that killed the process.
+
+        Raises:
+            OSError: The process cannot be started.
         """
         pipe = HeartbeatPipe(self._on_beat)
         try:
@@ -267,8 +278,7 @@ class ChildProcess:
                 self._heard_until_s = float("inf")
                 self.kill()
 
-    async def _back_off(self, code: int) -> None:
-        how = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
+    async def _back_off(self, how: str) -> None:
         log.error("%s: its process %s; restarting it within its restart budget.", self.name, how)
         await asyncio.sleep(self._budget.record_failure(self._loop.time()))
         self.restarts += 1

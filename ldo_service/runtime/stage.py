@@ -164,7 +164,7 @@ class Stage:
             past=self._checkpointer.past.inputs,
             is_held=self._starts_paused(),
         )
-        self._orders = CommandReceiver(self.name, self._transport, mailbox.put_command)
+        self._commands = CommandReceiver(self.name, self._transport, mailbox.put_command)
         if self._drain_requested:
             mailbox.close()
         else:
@@ -174,7 +174,7 @@ class Stage:
     def _close_ports(self, mailbox: Mailbox) -> None:
         mailbox.close()
         mailbox.disconnect()
-        self._orders.close()
+        self._commands.close()
         self._outlets.close()
         self._health.close()
 
@@ -330,9 +330,9 @@ class Stage:
         await self._save_and_send(produced, whole=True)
 
     # --- commands -------------------------------------------------------------------------------
-    async def _execute(self, order: StageCommand, mailbox: Mailbox) -> None:
+    async def _execute(self, command: StageCommand, mailbox: Mailbox) -> None:
         try:
-            match order.what:
+            match command.what:
                 case "pause":
                     mailbox.pause()
                 case "resume":
@@ -342,15 +342,15 @@ class Stage:
                 case "save":
                     await self._saver.save_checkpoint(self._actor)
                 case "keep":
-                    return await self._saver.keep(self._actor, order, self._orders.report)
+                    return await self._saver.keep(self._actor, command, self._commands.reply)
         except Exception as error:
             log.exception(
                 "%s: command %s failed. Repeat `ldo control %s` or restart the service.",
-                self.name, order.what, order.what,
+                self.name, command.what, command.what,
             )  # fmt: skip
-            self._orders.report(order, f"{type(error).__name__}: {error}")
+            self._commands.reply(command, f"{type(error).__name__}: {error}")
         else:
-            self._orders.report(order, "")
+            self._commands.reply(command, "")
 
     async def _reset(self, mailbox: Mailbox) -> None:
         """Replace the actor by a new, empty one under a new epoch; other actors connect again."""

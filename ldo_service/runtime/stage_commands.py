@@ -95,40 +95,40 @@ class CommandReceiver:
         self._under_way: set[int] = set()
         self._done: dict[int, StageReply] = {}
         self._last: dict[int, int] = {}  # Highest number of each sender, by its upper bits.
-        self._reports = transport.publisher(REPLY_KEY)
+        self._replies = transport.publisher(REPLY_KEY)
         transport.subscribe(COMMAND_KEY, self._arrived)
 
-    def report(self, order: StageCommand, error: str) -> None:
+    def reply(self, command: StageCommand, error: str) -> None:
         """Send the reply to a command; an empty error means success."""
-        self._under_way.discard(order.number)
-        reply = self._done[order.number] = StageReply(order.number, self._stage, error)
+        self._under_way.discard(command.number)
+        reply = self._done[command.number] = StageReply(command.number, self._stage, error)
         while len(self._done) > MAX_REPLIES:
             del self._done[next(iter(self._done))]
-        self._reports.post(b"", encode_link(reply))
+        self._replies.post(b"", encode_link(reply))
 
     def close(self) -> None:
         """Close the publisher of replies."""
-        self._reports.close()
+        self._replies.close()
 
     def _arrived(self, _header: bytes, body: memoryview) -> None:
         """Decode a command on any thread, and handle it on the event loop."""
         with suppress(msgspec.DecodeError):
-            order = decode(body, StageCommand)
-            if order.stage == self._stage:
-                call_soon(self._loop, self._take_once, order)
+            command = decode(body, StageCommand)
+            if command.stage == self._stage:
+                call_soon(self._loop, self._take_once, command)
 
-    def _take_once(self, order: StageCommand) -> None:
-        if order.number in self._done:
-            self._reports.post(b"", encode_link(self._done[order.number]))
-        elif order.number in self._under_way:
+    def _take_once(self, command: StageCommand) -> None:
+        if command.number in self._done:
+            self._replies.post(b"", encode_link(self._done[command.number]))
+        elif command.number in self._under_way:
             pass
-        elif order.number <= self._last.get(order.number >> COUNT_BITS, 0):
-            self.report(order, REPLACED)
+        elif command.number <= self._last.get(command.number >> COUNT_BITS, 0):
+            self.reply(command, REPLACED)
         else:
-            self._remember(order.number)
-            self._under_way.add(order.number)
-            for replaced in self._take(order):
-                self.report(replaced, REPLACED)
+            self._remember(command.number)
+            self._under_way.add(command.number)
+            for replaced in self._take(command):
+                self.reply(replaced, REPLACED)
 
     def _remember(self, number: int) -> None:
         """Remember the number as the highest one of its sender."""
@@ -147,13 +147,13 @@ class CommandSender:
 
     def __init__(self, transport: Transport) -> None:
         self._loop = asyncio.get_running_loop()
-        self._reports: dict[int, asyncio.Future[str]] = {}
+        self._pending: dict[int, asyncio.Future[str]] = {}
         self._of_stage = defaultdict[str, asyncio.Lock](asyncio.Lock)  # Held for a command.
         self._number = (1 + secrets.randbits(30)) << COUNT_BITS  # Number of the last command.
-        self._orders = transport.publisher(COMMAND_KEY)
+        self._commands = transport.publisher(COMMAND_KEY)
         transport.subscribe(REPLY_KEY, self._arrived)
 
-    async def order(
+    async def send(
         self, what: What, stage: str, timeout_s: float, generation: tuple[int, int] = (0, 0)
     ) -> str:
         """Send a command to a stage and wait for its reply.
@@ -177,27 +177,27 @@ class CommandSender:
         except TimeoutError:
             return f"did not answer within {timeout_s:.0f} s"
 
-    async def _reply_to(self, order: StageCommand) -> str:
+    async def _reply_to(self, command: StageCommand) -> str:
         """Send a command until the reply to it arrives, and return the error in the reply."""
-        report = self._reports[order.number] = self._loop.create_future()
+        reply = self._pending[command.number] = self._loop.create_future()
         try:
-            while not report.done():
-                await self._orders.send(b"", encode_link(order))
-                await asyncio.wait({report}, timeout=REPEAT_AFTER_S)
-            return report.result()
+            while not reply.done():
+                await self._commands.send(b"", encode_link(command))
+                await asyncio.wait({reply}, timeout=REPEAT_AFTER_S)
+            return reply.result()
         finally:
-            del self._reports[order.number]
+            del self._pending[command.number]
 
     def close(self) -> None:
         """Close the publisher of commands."""
-        self._orders.close()
+        self._commands.close()
 
     def _arrived(self, _header: bytes, body: memoryview) -> None:
         """Decode a reply on any thread, and handle it on the event loop."""
         with suppress(msgspec.DecodeError):
-            call_soon(self._loop, self._reported, decode(body, StageReply))
+            call_soon(self._loop, self._take_reply, decode(body, StageReply))
 
-    def _reported(self, report: StageReply) -> None:
-        future = self._reports.get(report.number)
+    def _take_reply(self, reply: StageReply) -> None:
+        future = self._pending.get(reply.number)
         if future is not None and not future.done():
-            future.set_result(report.error)
+            future.set_result(reply.error)

@@ -136,7 +136,7 @@ class StateSaver:
         await self._worker.run(self._write_checkpoint, actor, self._links())
 
     async def keep(
-        self, actor: Actor, order: StageCommand, report: Callable[[StageCommand, str], None]
+        self, actor: Actor, command: StageCommand, reply: Callable[[StageCommand, str], None]
     ) -> None:
         """Copy the last saved state for a generation, and write the copy in the background.
 
@@ -145,24 +145,24 @@ class StateSaver:
 
         Args:
             actor: The actor of the stage.
-            order: The command, with the number of the generation.
-            report: Function that sends the reply to the command. It is called with the command and
+            command: The command, with the number of the generation.
+            reply: Function that sends the reply to the command. It is called with the command and
                 an error message; the message is empty after the copy is written.
         """
         if self._syncing:
-            report(order, "is still writing the previous generation")
+            reply(command, "is still writing the previous generation")
             return
-        generation = order.generation, order.completed
-        is_previous_complete = self._checkpointer.is_last_kept(order.completed)
+        generation = command.generation, command.completed
+        is_previous_complete = self._checkpointer.is_last_kept(command.completed)
         try:
             files, paths = await self._worker.run(self._checkpointer.keep, actor, *generation)
         except (OSError, DataError) as error:
-            report(order, f"cannot keep its state: {error}")
+            reply(command, f"cannot keep its state: {error}")
             return
         self._outlets.keep(is_previous_complete=is_previous_complete)
         self._unsynced.update(self._outlets.pop_unsynced())
         paths += sorted(self._unsynced)
-        task = asyncio.create_task(self._write_generation(files, paths, order, report))
+        task = asyncio.create_task(self._write_generation(files, paths, command, reply))
         self._syncing.add(task)
         task.add_done_callback(self._syncing.discard)
 
@@ -170,8 +170,8 @@ class StateSaver:
         self,
         files: GenerationFiles | None,
         paths: list[Path],
-        order: StageCommand,
-        report: Callable[[StageCommand, str], None],
+        command: StageCommand,
+        reply: Callable[[StageCommand, str], None],
     ) -> None:
         try:
             await asyncio.to_thread(sync_all, paths)
@@ -179,12 +179,12 @@ class StateSaver:
             if files is not None:
                 await asyncio.to_thread(files.write)
         except (OSError, DataError) as error:
-            report(order, f"cannot keep its state: {error}")
+            reply(command, f"cannot keep its state: {error}")
         except Exception as error:  # The service waits for a reply.
             log.exception("keeping a state failed. Please report the traceback.")
-            report(order, f"cannot keep its state: {error!r}")
+            reply(command, f"cannot keep its state: {error!r}")
         else:
-            report(order, "")
+            reply(command, "")
 
     def close(self) -> None:
         """Cancel the writing that `keep` began; the service gets no reply to the command `keep`."""

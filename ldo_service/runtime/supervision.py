@@ -58,11 +58,6 @@ class StopRequest:
         """Request a soft stop, or a hard stop if a soft stop is already requested."""
         (self._hard if self._soft.is_set() else self._soft).set()
 
-    @property
-    def is_requested(self) -> bool:
-        """True after the first call of `request`."""
-        return self._soft.is_set()
-
     async def wait_soft(self) -> None:
         """Wait for the first call of `request`, which requests a soft stop."""
         await self._soft.wait()

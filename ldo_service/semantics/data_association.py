@@ -305,10 +305,10 @@ def predict_boxes(
     """
     where = rows_of(table["members"], view.ids)
     there = ((where >= 0) & reliable_members(table))[:, :PROBES]
-    p_map = view.rows[np.maximum(where[:, :PROBES], 0), :3].astype(float)
+    p_map = np.zeros((*there.shape, 3))
+    p_map[there] = view.rows[where[:, :PROBES][there], :3]
     gone = ~there.any(axis=1)
-    p_map[gone, 0] = table["centroid"][gone]
-    there[gone, 0] = True
+    p_map[gone, 0], there[gone, 0] = table["centroid"][gone], True
     p = p_map @ T_camera_map[:3, :3].T + T_camera_map[:3, 3]
     near_m, far_m = (ends[:, 0] for ends in trimmed(p[..., 2:], there))
     px, measured_m = _measured(p, view)

@@ -162,7 +162,7 @@ def _of_backlogs(health: Health) -> Iterator[Problem]:
 
 
 def _is_backend(actor: str) -> bool:
-    return any(box.name == actor and box.is_backend for box in GRAPH)
+    return any(spec.name == actor and spec.is_backend for spec in GRAPH)
 
 
 def _of_disk(health: Health) -> Iterator[Problem]:
@@ -281,9 +281,9 @@ def _of_answers(health: Health) -> Iterator[str]:
             f"rejected {refused:.0f} of {questions:.0f} label results, because they had no label "
             "or a label outside the vocabulary; the regions of these results have no label"
         )
-    if untold := health.metrics.get("answers_without_logprobs"):
+    if without := health.metrics.get("answers_without_logprobs"):
         yield (
-            f"received {untold:.0f} label results without log-probabilities; their confidence is "
+            f"received {without:.0f} label results without log-probabilities; their confidence is "
             "vlm_labeller.http.default_confidence"
         )
     if refused := health.metrics.get("names_refused"):

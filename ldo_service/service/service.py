@@ -63,7 +63,7 @@ from ldo_service.transport.zenoh_transport import Endpoint, ZenohTransport, open
 
 from .metrics import HealthCollector
 from .metrics_server import serve_metrics
-from .state_folder import PAUSE_MARKER, RESET_MARKER, claim_state
+from .state_folder import PAUSE_MARKER, RESET_MARKER, claim_state, write_config
 
 log = logging.getLogger(__name__)
 
@@ -135,7 +135,10 @@ class Service:
         self._require_known(self.only)
         self._require_known(self.config.service.process_actors)
         raise_file_limit()
-        names, silent_after_s = [box.name for box in GRAPH], self.config.service.heartbeat_timeout_s
+        names, silent_after_s = (
+            [spec.name for spec in GRAPH],
+            self.config.service.heartbeat_timeout_s,
+        )
         keys = self.network.keys
         until_s = keys.valid_until_s() if keys else None
         health = HealthCollector(self.network.robot, names, silent_after_s, until_s)
@@ -212,7 +215,7 @@ class Service:
 
     @property
     def _local_actors(self) -> list[str]:
-        names = [box.name for box in GRAPH]
+        names = [spec.name for spec in GRAPH]
         return [name for name in names if name not in self.config.service.remote_actors]
 
     def _open_generations(self, transport: ZenohTransport) -> GenerationKeeper | None:
@@ -221,7 +224,7 @@ class Service:
             return None
         store = FolderStore(self.state / "state")
         local = self._local_actors
-        actors = [box.name for box in consumers_first(GRAPH) if box.name in local]
+        actors = [spec.name for spec in consumers_first(GRAPH) if spec.name in local]
         return GenerationKeeper(CommandSender(transport), store, actors)
 
     def _keep_last_generation(self) -> None:
@@ -242,8 +245,8 @@ class Service:
     ) -> Control:
         control = Control(
             transport,
-            actors=[box.name for box in GRAPH],
-            sources=[box.name for box in GRAPH if _is_fed_from_outside(box)],
+            actors=[spec.name for spec in GRAPH],
+            sources=[spec.name for spec in GRAPH if _is_fed_from_outside(spec)],
             saved_where=self._saved_where(),
             timeout_s=self.config.service.control_timeout_s,
             reset_marker=self.state / RESET_MARKER,
@@ -269,20 +272,20 @@ class Service:
         children: dict[str, ChildProcess] = {}
         runners: list[Runner] = []
         suspects = asyncio.Lock()  # Shared by all stages of this process.
-        for box in finish_order(GRAPH):
-            is_elsewhere = not self.only and box.name in self.config.service.remote_actors
-            if is_elsewhere or (self.only and box.name not in self.only):
+        for spec in finish_order(GRAPH):
+            is_elsewhere = not self.only and spec.name in self.config.service.remote_actors
+            if is_elsewhere or (self.only and spec.name not in self.only):
                 continue
-            if not self.only and box.name in self.config.service.process_actors:
-                children[box.name] = self._child(box, transport)
-                runners.append(children[box.name])
+            if not self.only and spec.name in self.config.service.process_actors:
+                children[spec.name] = self._child(spec, transport)
+                runners.append(children[spec.name])
             else:
-                runners.append(self._stage(box, transport, children, suspects))
+                runners.append(self._stage(spec, transport, children, suspects))
         return runners
 
     def _stage(
         self,
-        box: ActorSpec,
+        spec: ActorSpec,
         transport: ZenohTransport,
         children: dict[str, ChildProcess],
         suspects: asyncio.Lock,
@@ -291,7 +294,7 @@ class Service:
             if consumer in children:
                 children[consumer].kill()
 
-        make = box.make
+        make = spec.make
         assert make is not None
         config = self.config.with_map_folder(self.state / "map")
         parameters = actor_parameters(config)
@@ -307,28 +310,29 @@ class Service:
                     self.state / "state", syncs=syncs, has_generations=has_generations
                 ),
                 expected={
-                    out.topic.name: lossless_consumers(GRAPH, out.topic.name) for out in box.outputs
+                    out.topic.name: lossless_consumers(GRAPH, out.topic.name)
+                    for out in spec.outputs
                 },
                 with_backlog={
                     out.topic.name: consumers_with_backlog(GRAPH, out.topic.name)
-                    for out in box.outputs
+                    for out in spec.outputs
                 },
                 on_evicted=evicted,
-                journal=self._journal(box.name, Path(config.mapper.image_folder)),
+                journal=self._journal(spec.name, Path(config.mapper.image_folder)),
                 heartbeat=start_heartbeat() if self.only else None,
                 suspects=suspects,
-                starts_paused=lambda: self._is_paused(box),
+                starts_paused=lambda: self._is_paused(spec),
             )
         except (KeyError, ValueError, TypeError, IndexError) as error:
             raise ConfigError(
-                f"the state of {box.name} in {self.state} does not fit this version ({error!r}). "
+                f"the state of {spec.name} in {self.state} does not fit this version ({error!r}). "
                 "Choose another folder with --state, or delete this folder to start with an empty "
                 "map."
             ) from error
 
-    def _is_paused(self, box: ActorSpec) -> bool:
+    def _is_paused(self, spec: ActorSpec) -> bool:
         """Return whether a file says that an actor takes no messages; see `Control`."""
-        is_paused = _is_fed_from_outside(box) and (self.state / PAUSE_MARKER).exists()
+        is_paused = _is_fed_from_outside(spec) and (self.state / PAUSE_MARKER).exists()
         return is_paused or (self.state / RESET_MARKER).exists()
 
     def _journal(self, actor: str, map_folder: Path) -> Journal:
@@ -336,25 +340,24 @@ class Service:
             return Journal()
         return open_recorder(self.recording, actor, self.network.robot, self.config, map_folder)
 
-    def _child(self, box: ActorSpec, transport: ZenohTransport) -> ChildProcess:
-        config = self.state / "config.yaml"
-        config.write_text(config_yaml(self.config))
+    def _child(self, spec: ActorSpec, transport: ZenohTransport) -> ChildProcess:
+        config = write_config(self.state, config_yaml(self.config))
         command = python_command(
-            *("serve", "--actor", box.name, "--robot", self.network.robot),
+            *("serve", "--actor", spec.name, "--robot", self.network.robot),
             *("--endpoint", self.network.local_endpoint),
             *("--config", str(config), "--state", str(self.state)),
             *(("--record", str(self.recording)) if self.recording else ()),
         )
         stage = stage_parameters(self.config)
         return ChildProcess(
-            box.name,
+            spec.name,
             command,
             transport,
             max_restarts=stage.max_restarts,
             restart_window_s=stage.restart_window_s,
             restart_delay_s=stage.restart_delay_s,
             silent_after_s=self.config.service.heartbeat_timeout_s,
-            step_timeout_s=stage.step_limit(box.is_backend)[0],
+            step_timeout_s=stage.step_limit(spec.is_backend)[0],
         )
 
     async def _stop_with_parent(self, stop: StopRequest) -> None:
@@ -368,8 +371,8 @@ class Service:
             actor_spec(name)
 
 
-def _is_fed_from_outside(box: ActorSpec) -> bool:
-    return any(port.topic in FROM_OUTSIDE for port in box.inputs)
+def _is_fed_from_outside(spec: ActorSpec) -> bool:
+    return any(port.topic in FROM_OUTSIDE for port in spec.inputs)
 
 
 def _leave_if_busy(exit_code: int, why: str) -> None:

@@ -86,6 +86,33 @@ def _folder_error(folder: Path, error: OSError) -> ConfigError:
     )
 
 
+def write_config(folder: Path, text: str) -> Path:
+    """Write the configuration for child processes to the state folder, unless it is there already.
+
+    A service whose configuration has not changed therefore starts even if the disk is full.
+
+    Args:
+        folder: The state folder.
+        text: The configuration in YAML.
+
+    Returns:
+        The path of the file.
+
+    Raises:
+        UnavailableError: The file cannot be read or written now.
+    """
+    path, body = folder / "config.yaml", text.encode()
+    try:
+        if not path.exists() or path.read_bytes() != body:
+            write_atomically(path, body)
+    except OSError as error:
+        raise UnavailableError(
+            f"{path} cannot be written: {error.strerror}. Free some disk space, or choose another "
+            "folder with --state."
+        ) from error
+    return path
+
+
 def claim_state(folder: Path, stack: ExitStack, remote_actors: Collection[str] = ()) -> None:
     """Lock the folder for this service, and check that the states of all actors match.
 

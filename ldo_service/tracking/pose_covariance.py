@@ -50,10 +50,8 @@ MIN_CONDITION = 1e-15  # Fraction of the largest eigenvalue; double precision re
 class CovarianceConfig:
     """Settings of the covariance of a pose.
 
-    The defaults were chosen on seven sequences with exact ground truth, by the mean normalized
-    estimation error squared (NEES). Its expected value is 6. The NEES was 1.7 to 5.0 on the five
-    sequences whose camera has few errors or none. It was 7.4 and 11.1 on the two sequences that
-    simulate all camera errors. See docs/benchmarks/covariance.md.
+    The defaults were chosen on sequences with exact ground truth, by the mean normalized estimation
+    error squared (NEES), whose expected value is 6. docs/benchmarks/covariance.md has its values.
     """
 
     scale: float = 5.0  # Factor on the covariance, before the floor is added.

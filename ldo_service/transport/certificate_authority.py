@@ -152,7 +152,11 @@ class CertificateAuthority:
         reached = (*HERE, *hosts) if role == "service" else ()
         certificate = self._make(name, common_name, days, reached, now or datetime.now(UTC))
         until = certificate.not_valid_after_utc.date()
-        self._grant({**self._access, common_name: AccessEntry(role, robot, until)})
+        try:
+            self._grant({**self._access, common_name: AccessEntry(role, robot, until)})
+        except ConfigError:
+            shutil.rmtree(self.folder / name, ignore_errors=True)
+            raise
         return self.folder / name
 
     def remove(self, name: str) -> None:
@@ -161,7 +165,7 @@ class CertificateAuthority:
         Routers that start with the new list deny the keys.
 
         Raises:
-            ConfigError: No keys have this name.
+            ConfigError: No keys have this name, or an access list cannot be written.
         """
         kept = {entry.common_name: entry.grantee for entry in self.entries if entry.name != name}
         if len(kept) == len(self._access):
@@ -194,13 +198,24 @@ class CertificateAuthority:
         return certificate
 
     def _grant(self, access: dict[str, AccessEntry]) -> None:
-        """Write the access list to this folder and to the folder of every service."""
-        self._access = access
+        """Write the access list to the folder of every service, and last to this folder.
+
+        Raises:
+            ConfigError: A list cannot be written; the list of this folder is unchanged.
+        """
+        before, self._access = self._access, access
         text = HEAD + dump_yaml(msgspec.to_builtins(access))
         services = {entry.name for entry in self.entries if entry.grantee.role == "service"}
-        for folder in (self.folder, *(self.folder / name for name in sorted(services))):
+        for folder in (*(self.folder / name for name in sorted(services)), self.folder):
             if folder.is_dir():  # The user may have moved the folder of a service.
-                write_atomically(folder / ACCESS, text.encode())
+                try:
+                    write_atomically(folder / ACCESS, text.encode())
+                except OSError as error:
+                    self._access = before
+                    raise ConfigError(
+                        f"{folder / ACCESS} cannot be written: {error.strerror}. Make it writable "
+                        "or free some disk space, and repeat the command."
+                    ) from error
 
 
 def _require_name(name: str) -> None:

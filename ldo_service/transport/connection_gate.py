@@ -285,13 +285,13 @@ async def _run(listener: socket.socket, host: str, port: int, max_connections: i
     gate = Gate(host, port, max_connections)
     parent_ended = asyncio.Event()
 
-    def take_order() -> None:
-        if order := os.read(sys.stdin.fileno(), 4096):
-            gate.redirect(int(order.split()[-1]))
+    def take_port() -> None:
+        if ports := os.read(sys.stdin.fileno(), 4096):
+            gate.redirect(int(ports.split()[-1]))
         else:
             parent_ended.set()
 
-    loop.add_reader(sys.stdin.fileno(), take_order)
+    loop.add_reader(sys.stdin.fileno(), take_port)
     async with await loop.create_server(lambda: Side(gate), sock=listener):
         await parent_ended.wait()
     os._exit(0)  # The router is gone, so connections need not be closed in order.

@@ -14,6 +14,7 @@ from .keys import TlsKeys
 LOOPBACK = "127.0.0.1"
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+MAX_PORT = 65_535
 # Maximum size of a message. A 4K frame with depth in floats has 58 MB. Zenoh's default maximum is
 # 1074 MB.
 MAX_MESSAGE_MB = 128
@@ -44,6 +45,12 @@ class Endpoint:
 
     def __post_init__(self) -> None:
         require_robot(self.robot)
+        port = self.address[1]
+        if port.isdecimal() and int(port) > MAX_PORT:
+            raise ConfigError(
+                f"endpoint {self.endpoint} has the port {port}, which must be at most {MAX_PORT}. "
+                "Choose another port."
+            )
         is_tls = self.endpoint.startswith("tls/")
         if is_tls and self.keys is None:
             raise ConfigError(

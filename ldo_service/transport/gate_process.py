@@ -1,6 +1,7 @@
 """Process of the gate in front of the TLS port of a router; see `connection_gate`."""
 
 import logging
+import os
 import resource
 import socket
 import subprocess
@@ -10,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from threading import Event, Thread
+from threading import Event, Lock, Thread
 
 from ldo_service.errors import UnavailableError
 
@@ -79,6 +80,7 @@ class GateProcess:
         self._max_connections = min(MAX_SESSIONS, soft // DESCRIPTORS_PER_CONNECTION)
         self._listener = listener
         self._closing = Event()
+        self._lock = Lock()  # Held while a process is started or gets another port.
         self._process = self._start()
         self._watch = Thread(target=self._restart, name="gate", daemon=True)
         self._watch.start()
@@ -90,13 +92,14 @@ class GateProcess:
 
     def redirect(self, router_port: int) -> None:
         """Close all connections, and pass new ones on to another port of the router."""
-        self._router_port = router_port
-        stdin = self._process.stdin
-        assert stdin is not None
-        # A process that has ended is started again with the new port; its input may be closed.
-        with suppress(OSError, ValueError):
-            stdin.write(f"{router_port}\n")
-            stdin.flush()
+        with self._lock:
+            self._router_port = router_port
+            stdin = self._process.stdin
+            assert stdin is not None
+            # A process that has ended is started again with the new port; its input may be closed.
+            # A buffer would keep the line, and closing the input would fail because of it.
+            with suppress(OSError, ValueError):
+                os.write(stdin.fileno(), f"{router_port}\n".encode())
 
     def close(self) -> None:
         """End the process."""
@@ -147,7 +150,8 @@ class GateProcess:
     def _start_again(self) -> bool:
         """Start the process, and return whether the machine had the memory and descriptors."""
         try:
-            self._process = self._start()
+            with self._lock:
+                self._process = self._start()
         except OSError as error:
             log.error("service: the gate of the TLS port cannot be started: %s; trying again.",
                       error.strerror)  # fmt: skip

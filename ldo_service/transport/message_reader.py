@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 import msgspec
 import zenoh
 
+from ldo_service.errors import ConfigError
 from ldo_service.schemas import Message, decode
 from ldo_service.schemas.topics import Topic
 
@@ -75,7 +76,11 @@ class MessageReader:
     def request(
         self, topic: Topic, message: Message, answer: type[M], timeout_s: float
     ) -> M | None:
-        """Send a request; return the answer, or None if none arrives within `timeout_s`."""
+        """Send a request; return the answer, or None if none arrives within `timeout_s`.
+
+        Raises:
+            ConfigError: The answer is malformed.
+        """
         replies = self._session.get(
             self._network.expression(topic.name),
             payload=msgspec.msgpack.encode(message),
@@ -83,7 +88,14 @@ class MessageReader:
         )
         for reply in replies:
             if reply.ok is not None:
-                return _message_of(reply.ok, answer)
+                try:
+                    return _message_of(reply.ok, answer)
+                except msgspec.DecodeError as error:
+                    raise ConfigError(
+                        f"the service answered on {topic.name} with a malformed "
+                        f"{answer.__name__}: {error}. Check that the service has the same version "
+                        "as this program."
+                    ) from error
         return None
 
     def live_actors(self, timeout_s: float) -> set[str]:

@@ -54,11 +54,29 @@ def test_help_omits_defaults_that_say_nothing(capsys) -> None:
     assert "(required)" in out
 
 
-def test_unknown_option_points_to_the_help_of_the_verb(capsys) -> None:
-    code, _, err = ldo(capsys, "run", "synthetic:room", "--out", "x", "--foo")
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        ("run synthetic:room --out x --foo", "--foo"),
+        ("run synthetic:room --out x --max-frame 3", "meant: --max-frames"),
+        ("run synthetic:room", "--out DIR"),
+        ("run synthetic:room --out x --stride many", "'many'"),
+        ("run synthetic:room --out x --device tpu", "'tpu'"),
+        ("keys", "init"),
+    ],
+)
+def test_wrong_argument_points_to_the_help_of_the_verb(capsys, words: str, part: str) -> None:
+    code, _, err = ldo(capsys, *words.split())
     assert code == 2
-    assert "--foo" in err
-    assert "ldo run --help" in err
+    assert_one_paragraph(err)
+    assert part in err
+    assert err.endswith(f"ldo {words.split()[0]} --help.\n")
+
+
+def test_unknown_verb_names_the_nearest_one(capsys) -> None:
+    code, _, err = ldo(capsys, "sreve")
+    assert code == 2
+    assert err == "ldo: there is no command 'sreve'. Did you mean serve?\n"
 
 
 def test_a_missing_source_is_bad_data(capsys, tmp_path: Path) -> None:

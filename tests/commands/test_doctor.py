@@ -69,6 +69,17 @@ def test_check_of_a_folder_without_a_folder_is_an_error(
         doctor.doctor(check)
 
 
+@pytest.mark.parametrize(
+    ("endpoint", "mark"), [("tcp/127.0.0.1:1", "absent"), ("127.0.0.1:7447", "bad")]
+)
+def test_malformed_endpoint_is_bad_and_a_service_that_does_not_run_is_absent(
+    endpoint: str, mark: str
+) -> None:
+    (finding,) = doctor.service("robot", endpoint, None)
+    assert finding.mark == mark
+    assert endpoint in finding.text
+
+
 @pytest.mark.parametrize("window_s", [0.0, float("nan"), float("inf")])
 def test_window_must_be_positive_and_finite(window_s: float) -> None:
     with pytest.raises(ConfigError, match=f"--window-s {window_s:g} must be positive and finite"):

@@ -46,6 +46,7 @@ def example_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("publish nowhere", 3, "nowhere does not exist"),
         ("publish junk", 3, "junk holds no camera/rgbd"),
         ("publish realsense --size 3", 2, "--size 3"),
+        ("publish realsense --size 0x480", 2, "--size 0x480"),
         ("publish realsense --rate 3", 2, "--rate applies to sequences"),
         ("publish ros2", 2, "needs --color TOPIC and --depth TOPIC"),
         ("publish ros2 --color /c/image_raw --depth /d/*", 2, "is not a valid ROS topic"),

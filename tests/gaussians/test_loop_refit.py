@@ -28,7 +28,9 @@ class MapStub:
         poses = PoseTable()
         for keyframe in range(5):
             poses[keyframe] = np.eye(4)
-        self.views = SimpleNamespace(poses=poses, cameras=dict.fromkeys(range(5)))
+        self.views = SimpleNamespace(
+            poses=poses, cameras=dict.fromkeys(range(5)), store=set(range(5))
+        )
         self.offloaded = offloaded
         self.iterations: list[int] = []
 
@@ -70,6 +72,15 @@ def test_iterations_of_offloaded_keyframes_stay_pending() -> None:
         refit.with_keyframe(is_behind=False)
     assert map_.iterations == [4]
     assert refit.pending_iterations == 4
+
+
+def test_iterations_of_keyframes_whose_images_cannot_be_read_are_dropped() -> None:
+    map_ = MapStub(offloaded=set())
+    refit = refit_after_correction(map_)
+    map_.views.store -= {3, 4}
+    refit.while_idle()
+    assert map_.iterations == []
+    assert refit.pending_iterations == 0
 
 
 def test_correction_that_bends_a_path_displaces_keyframes_only_where_it_returns() -> None:

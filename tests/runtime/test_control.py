@@ -259,7 +259,7 @@ async def test_incomplete_reset_holds_all_actors_until_it_is_repeated(tmp_path: 
 async def test_actor_that_is_reset_before_its_producer_takes_nothing_of_the_old_run() -> None:
     scene = Scene(actors=("collector", "source"))
     async with scene.started():
-        assert await scene.control._commander.order("pause", "collector", 5.0) == ""
+        assert await scene.control._sender.send("pause", "collector", 5.0) == ""
         scene.send(1)
         await eventually(lambda: scene.source.health().steps == 1)
         assert (await scene.request("reset")).ok
@@ -291,7 +291,7 @@ async def test_restarted_actor_is_reset_although_no_consumer_takes_its_saved_out
     async with running(source()):
         sender = CommandSender(transport)
         for what in ("pause", "reset"):
-            assert await sender.order(what, "source", 5.0) == ""
+            assert await sender.send(what, "source", 5.0) == ""
 
 
 async def test_reset_of_the_previous_process_is_completed(tmp_path: Path) -> None:

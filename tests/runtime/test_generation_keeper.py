@@ -36,7 +36,7 @@ class Stages(CommandSender):
         self.kept: list[tuple[str, int, int]] = []
         self.before_keep: Callable[[str], None] = lambda _actor: None
 
-    async def order(
+    async def send(
         self, what: What, stage: str, timeout_s: float, generation: tuple[int, int] = (0, 0)
     ) -> str:
         assert what == "keep"

@@ -144,6 +144,15 @@ def test_retained_messages_do_not_exceed_their_maximum_size() -> None:
     assert outbox.in_memory[0].seq == 9
 
 
+def test_message_after_a_time_without_consumers_is_found() -> None:
+    outbox = outbox_of(5)
+    outbox.keep(2, is_previous_complete=False)
+    outbox.forget(5)  # The only consumer has left; the outlet adds no messages without consumers.
+    outbox.add(UnackedMessage(20, b"", b"new"))
+    assert outbox.read(20) == UnackedMessage(20, b"", b"new")
+    assert outbox.read(7) is None
+
+
 def test_logged_messages_of_any_size_are_retained_on_disk_only(tmp_path: Path) -> None:
     log = MessageLog(tmp_path, 1, 0, 0, max_bytes=10 * MAX_RETAINED_BYTES)
     outbox = Outbox(log=log, retained_from=0)

@@ -191,13 +191,14 @@ async def test_undecodable_body_is_rejected_and_the_next_is_handled() -> None:
         assert stage.health().failures == 0
 
 
-async def test_oversized_message_is_rejected_before_decoding() -> None:
+async def test_oversized_message_is_rejected_before_decoding(caplog) -> None:
     transport = MemoryTransport()
     mailbox = Mailbox("me", (In(NUMBERS, Latest(4)),), transport, max_bytes=100)
     transport.deliver(NUMBERS.name, b"", bytes(101))
     transport.deliver(NUMBERS.name, b"", bytes(100))  # It is malformed, but not yet decoded.
     (counted,) = mailbox.counts()
     assert (counted.rejected, counted.queued) == (1, 1)
+    assert "101 bytes exceed service.max_decoded_message_mb=0.0001. Raise" in caplog.text
 
 
 async def test_rejections_are_logged_once_per_episode_and_each_counted(caplog) -> None:

@@ -121,6 +121,25 @@ async def test_process_that_keeps_failing_exhausts_its_restarts(
     assert "ended with exit code 3" in caplog.text
 
 
+async def test_process_that_cannot_be_started_is_tried_again(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    start, failures = asyncio.create_subprocess_exec, list(range(2))
+
+    async def start_later(*command: Any, **options: Any) -> asyncio.subprocess.Process:
+        if failures:
+            failures.pop()
+            raise OSError(12, "Cannot allocate memory")
+        return await start(*command, **options)
+
+    monkeypatch.setattr(asyncio, "create_subprocess_exec", start_later)
+    process = child("import time; time.sleep(1e6)")
+    async with running(process):
+        await eventually(lambda: process.pid is not None)
+    assert process.restarts == 2
+    assert "its process cannot be started: Cannot allocate memory" in caplog.text
+
+
 async def test_silent_process_is_restarted() -> None:
     silent = child("import time; time.sleep(1e6)", start_within_s=0.1, silent_after_s=0.1)
     async with running(silent):

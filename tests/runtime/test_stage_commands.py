@@ -71,7 +71,7 @@ def feed(transport: MemoryTransport, *values: int) -> None:
 async def test_paused_stage_drops_and_counts_messages() -> None:
     transport, seen = MemoryTransport(), []
     stage = collector(transport, seen, policy=Latest(2))
-    commander = CommandSender(transport)
+    sender = CommandSender(transport)
 
     def deliver(*values: int) -> None:
         for value in values:
@@ -82,10 +82,10 @@ async def test_paused_stage_drops_and_counts_messages() -> None:
     async with running(stage):
         deliver(1)
         await eventually(lambda: seen == [1])
-        assert await commander.order("pause", "collector", 60) == ""
+        assert await sender.send("pause", "collector", 60) == ""
         assert stage.health().paused
         deliver(2, 3, 4)
-        assert await commander.order("resume", "collector", 60) == ""
+        assert await sender.send("resume", "collector", 60) == ""
         deliver(5)
         await eventually(lambda: seen == [1, 5] and stage.health().inputs[0].delivered == 2)
         (counted,) = stage.health().inputs
@@ -95,16 +95,16 @@ async def test_paused_stage_drops_and_counts_messages() -> None:
 
 async def test_paused_stage_keeps_messages_of_a_lossless_input() -> None:
     transport, seen = MemoryTransport(), []
-    stage, commander = collector(transport, seen), CommandSender(transport)
+    stage, sender = collector(transport, seen), CommandSender(transport)
     numbers = Outlet(Out(NUMBERS), "source", 1, transport, {"collector"})
     async with running(stage):
-        await commander.order("pause", "collector", 60)
+        await sender.send("pause", "collector", 60)
         for value in range(4):
             await send(numbers, number(value))
         waiting = asyncio.create_task(send(numbers, number(4)))
         await asyncio.sleep(0.05)
         assert (seen, waiting.done()) == ([], False)
-        await commander.order("resume", "collector", 60)
+        await sender.send("resume", "collector", 60)
         await eventually(lambda: seen == [0, 1, 2, 3, 4])
         await waiting
 
@@ -112,11 +112,11 @@ async def test_paused_stage_keeps_messages_of_a_lossless_input() -> None:
 async def test_pause_waits_for_the_current_step() -> None:
     transport, seen, release = MemoryTransport(), [], Event()
     stage = collector(transport, seen, lambda _value: release.wait(60) and None, policy=Latest(1))
-    commander = CommandSender(transport)
+    sender = CommandSender(transport)
     async with running(stage):
         transport.deliver(NUMBERS.name, encode_link(EXTERNAL_HEADER), encode_message(number(1)))
         await eventually(lambda: stage.health().state == "busy")
-        pausing = asyncio.create_task(commander.order("pause", "collector", 60))
+        pausing = asyncio.create_task(sender.send("pause", "collector", 60))
         await asyncio.sleep(0.05)
         assert not pausing.done()
         release.set()
@@ -127,12 +127,12 @@ async def test_pause_waits_for_the_current_step() -> None:
 async def test_busy_stage_keeps_its_state_once_for_all_waiting_commands() -> None:
     transport, seen, release = MemoryTransport(), [], Event()
     stage = collector(transport, seen, lambda _value: release.wait(60) and None, policy=Latest(1))
-    commander = CommandSender(transport)
+    sender = CommandSender(transport)
     async with running(stage):
         transport.deliver(NUMBERS.name, encode_link(EXTERNAL_HEADER), encode_message(number(1)))
         await eventually(lambda: stage.health().state == "busy")
         answers = [
-            asyncio.create_task(commander.order("keep", "collector", 60, (number, 0)))
+            asyncio.create_task(sender.send("keep", "collector", 60, (number, 0)))
             for number in range(1, 6)
         ]
         await eventually(lambda: sum(answer.done() for answer in answers) == 4)
@@ -145,9 +145,9 @@ async def test_busy_stage_keeps_its_state_once_for_all_waiting_commands() -> Non
 
 async def test_soft_stop_ends_a_paused_stage() -> None:
     transport, seen = MemoryTransport(), []
-    stage, commander = collector(transport, seen), CommandSender(transport)
+    stage, sender = collector(transport, seen), CommandSender(transport)
     async with running(stage) as (task,):
-        await commander.order("pause", "collector", 60)
+        await sender.send("pause", "collector", 60)
         stage.drain()
         await asyncio.wait_for(task, 60)
 
@@ -156,16 +156,16 @@ async def test_reset_stage_starts_empty_and_its_consumer_continues() -> None:
     transport, seen, store = MemoryTransport(), [], MemoryStore()
     expected = {NUMBERS.name: frozenset({"collector"})}
     counter = Stage(Counter, transport, config=QUICK, store=store, expected=expected)
-    commander = CommandSender(transport)
+    sender = CommandSender(transport)
     async with running(counter, collector(transport, seen)):
         feed(transport, 10)
         await eventually(lambda: seen == [1])
         feed(transport, 11)
         await eventually(lambda: seen == [1, 2])
-        await commander.order("save", "counter", 60)
+        await sender.send("save", "counter", 60)
         epoch = counter.health().epoch
         for command in ("pause", "reset", "resume"):
-            assert await commander.order(command, "counter", 5) == ""
+            assert await sender.send(command, "counter", 5) == ""
         assert counter.health().epoch != epoch
         assert RestoredState.of(store.load("counter")).own == {}
         feed(transport, 12)
@@ -176,12 +176,12 @@ async def test_reset_stage_starts_empty_and_its_consumer_continues() -> None:
 
 async def test_reset_consumer_reconnects_to_its_producer() -> None:
     transport, seen = MemoryTransport(), []
-    stage, commander = collector(transport, seen), CommandSender(transport)
+    stage, sender = collector(transport, seen), CommandSender(transport)
     numbers = Outlet(Out(NUMBERS), "source", 1, transport, {"collector"})
     async with running(stage):
         await send(numbers, number(0))
         await eventually(lambda: seen == [0])
-        assert await commander.order("reset", "collector", 60) == ""
+        assert await sender.send("reset", "collector", 60) == ""
         for value in range(1, 9):
             await send(numbers, number(value))
         await eventually(lambda: seen == list(range(9)))
@@ -190,15 +190,15 @@ async def test_reset_consumer_reconnects_to_its_producer() -> None:
 async def test_messages_from_before_a_reset_are_not_handled() -> None:
     transport, seen = MemoryTransport(), []
     doubles = DoubleCollector(seen)
-    stage, commander = Stage(lambda: doubles, transport, config=QUICK), CommandSender(transport)
+    stage, sender = Stage(lambda: doubles, transport, config=QUICK), CommandSender(transport)
     old = Outlet(Out(DOUBLES), "source", 7, transport)
     async with running(stage):
         await eventually(lambda: "double_collector" in old._consumers)
-        await commander.order("pause", "double_collector", 60)
+        await sender.send("pause", "double_collector", 60)
         await send(old, Double(stamp_ns=1, value=1))
         old.reset(8)
-        await commander.order("reset", "double_collector", 60)
-        await commander.order("resume", "double_collector", 60)
+        await sender.send("reset", "double_collector", 60)
+        await sender.send("resume", "double_collector", 60)
         await eventually(lambda: old.credits() == 2)
         await send(old, Double(stamp_ns=2, value=2))
         await eventually(lambda: seen == [2])
@@ -216,17 +216,17 @@ async def test_query_returns_no_value_from_before_a_reset() -> None:
 async def test_save_command_writes_a_full_checkpoint(tmp_path: Path) -> None:
     transport, store = MemoryTransport(), FolderStore(tmp_path)
     counter = Stage(Counter, transport, config=QUICK, store=store)
-    commander = CommandSender(transport)
+    sender = CommandSender(transport)
     async with running(counter):
         feed(transport, 1)
         await eventually(lambda: counter.health().steps == 1)
         assert FolderStore(tmp_path).load("counter") is None
-        assert await commander.order("save", "counter", 60) == ""
+        assert await sender.send("save", "counter", 60) == ""
         assert FolderStore(tmp_path).load("counter") == {"count": 1}
         store.delete("counter")
         assert FolderStore(tmp_path).load("counter") is None
         assert list((tmp_path / "counter").iterdir()) == []
-        assert await commander.order("save", "counter", 60) == ""
+        assert await sender.send("save", "counter", 60) == ""
         assert FolderStore(tmp_path).load("counter") == {"count": 1}
 
 
@@ -235,7 +235,7 @@ async def test_failed_save_is_reported_and_the_stage_continues(tmp_path: Path) -
     counter = Stage(Counter, transport, config=QUICK, store=FolderStore(tmp_path))
     (tmp_path / "counter").write_text("a file where the folder should be")
     async with running(counter):
-        assert "FileExistsError" in await CommandSender(transport).order("save", "counter", 60)
+        assert "FileExistsError" in await CommandSender(transport).send("save", "counter", 60)
         feed(transport, 1)
         await eventually(lambda: counter.health().steps == 1)
 
@@ -246,10 +246,10 @@ async def test_command_runs_once_although_commands_and_replies_are_lost(
     monkeypatch.setattr(stage_commands, "REPEAT_AFTER_S", 0.01)
     losses = iter([True, True, False, True, True, False, True] + [False] * 1000)
     transport = MemoryTransport(lose=lambda key: "link/" in key and next(losses))
-    counter, commander = Stage(Counter, transport, config=QUICK), CommandSender(transport)
+    counter, sender = Stage(Counter, transport, config=QUICK), CommandSender(transport)
     epochs = [counter.health().epoch]
     async with running(counter):
-        assert await commander.order("reset", "counter", 60) == ""
+        assert await sender.send("reset", "counter", 60) == ""
         epochs.append(counter.health().epoch)
         await asyncio.sleep(0.05)
         assert counter.health().epoch == epochs[1] != epochs[0]
@@ -257,23 +257,23 @@ async def test_command_runs_once_although_commands_and_replies_are_lost(
 
 async def test_late_command_of_a_sender_does_not_undo_a_newer_one() -> None:
     transport, seen = MemoryTransport(), []
-    stage, commander = collector(transport, seen), CommandSender(transport)
+    stage, sender = collector(transport, seen), CommandSender(transport)
     sent: list[bytes] = []
     transport.subscribe(COMMAND_KEY, lambda _, body: sent.append(bytes(body)))
     async with running(stage):
-        assert await commander.order("resume", "absent", 0.01) != ""
+        assert await sender.send("resume", "absent", 0.01) != ""
         late = StageCommand(decode(sent[0], StageCommand).number, "pause", "collector")
-        assert await commander.order("resume", "collector", 60) == ""
+        assert await sender.send("resume", "collector", 60) == ""
         transport.deliver(COMMAND_KEY, b"", encode_link(late))
         await asyncio.sleep(0.01)
         assert not stage.health().paused
-        assert await CommandSender(transport).order("pause", "collector", 60) == ""
+        assert await CommandSender(transport).send("pause", "collector", 60) == ""
         assert stage.health().paused
 
 
 async def test_missing_reply_is_reported() -> None:
-    commander = CommandSender(MemoryTransport())
-    assert await commander.order("pause", "absent", 0.01) == "did not answer within 0 s"
+    sender = CommandSender(MemoryTransport())
+    assert await sender.send("pause", "absent", 0.01) == "did not answer within 0 s"
 
 
 async def test_malformed_commands_are_ignored() -> None:

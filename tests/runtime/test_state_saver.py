@@ -61,10 +61,10 @@ async def running_doubler(store: FolderStore) -> AsyncIterator[CommandSender]:
 @asynccontextmanager
 async def doubler(folder: Path) -> AsyncIterator[Callable[[int], Awaitable[str]]]:
     """Run a stage whose outbox on disk has a message, and yield a function that keeps its state."""
-    async with running_doubler(FolderStore(folder)) as commander:
+    async with running_doubler(FolderStore(folder)) as sender:
 
         async def keep(generation: int) -> str:
-            return await commander.order("keep", "doubler", 60, (generation, 0))
+            return await sender.send("keep", "doubler", 60, (generation, 0))
 
         yield keep
 
@@ -116,8 +116,8 @@ async def test_write_that_takes_longer_than_the_time_limit_completes_a_generatio
     monkeypatch.setattr(generations, "KEEP_EVERY_S", 0.01)
     monkeypatch.setattr(state_saver, "sync_all", lambda _: time.sleep(0.3))
     store = FolderStore(tmp_path / "state")
-    async with running_doubler(store) as commander:
-        task = asyncio.create_task(GenerationKeeper(commander, store, ["doubler"]).run())
+    async with running_doubler(store) as sender:
+        task = asyncio.create_task(GenerationKeeper(sender, store, ["doubler"]).run())
         await eventually(lambda: completed_generation(store) is not None)
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)

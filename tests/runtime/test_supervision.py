@@ -40,7 +40,6 @@ async def test_soft_stop_loses_no_messages_in_flight() -> None:
         await send(numbers, number(value))
     await numbers.flush()
     stop.request()
-    assert stop.is_requested
     await service
     assert seen == [2 * value for value in range(20)]
 

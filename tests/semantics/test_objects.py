@@ -386,6 +386,17 @@ def test_objects_with_offloaded_gaussians_are_not_changed() -> None:
     assert entropies(before)[0] < 0.5
 
 
+def test_objects_in_view_stay_if_no_gaussian_is_in_memory() -> None:
+    labelled_map = LabelledMap()
+    observe_from_front(labelled_map, (BALL,), 4)
+    before = labelled_map.objects.landmarks
+    seen = labelled_map.view(shoot((BALL,), FRONT_POSE), NO_DETECTIONS)
+    names = "rows", "labels", "ids", "anchors", "indices", "regions"
+    empty = {name: getattr(seen, name)[:0] for name in names}
+    assert not labelled_map.objects.observe(replace(seen, **empty)).observations
+    np.testing.assert_array_equal(labelled_map.objects.landmarks, before)
+
+
 @pytest.mark.parametrize(
     "fields_", [{"min_keyframes": 0}, {"max_divergence": -1}, {"merge_overlap": 0}]
 )

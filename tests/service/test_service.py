@@ -2,16 +2,18 @@
 
 import asyncio
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
 
 from ldo_service.actors.topology import actor_spec
-from ldo_service.config import Config
-from ldo_service.errors import DamagedStateError
+from ldo_service.config import Config, load_config
+from ldo_service.errors import DamagedStateError, UnavailableError
 from ldo_service.runtime.generations import MARKER
 from ldo_service.service import service as module
+from ldo_service.service import state_folder
 from ldo_service.service.service import Service
 from ldo_service.service.state_folder import PAUSE_MARKER, RESET_MARKER
 from ldo_service.storage.state_store import FolderStore
@@ -60,6 +62,23 @@ async def test_pause_is_for_actors_that_take_frames_and_an_incomplete_reset_for_
     assert [is_paused() for is_paused in are_paused] == [False, False]
     (tmp_path / marker).touch()
     assert [is_paused() for is_paused in are_paused] == expected
+
+
+async def test_child_process_starts_on_a_full_disk_if_its_configuration_is_unchanged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fill_disk(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    service = Service(Config(), Endpoint("robot", "tcp/127.0.0.1:1"), tmp_path)
+    service._child(actor_spec("optimizer"), transport())
+    before = (tmp_path / "config.yaml").read_text()
+    monkeypatch.setattr(state_folder, "write_atomically", fill_disk)
+    service._child(actor_spec("optimizer"), transport())
+    changed = replace(service, config=load_config(settings=["mapper.iterations=7"]))
+    with pytest.raises(UnavailableError, match=r"config\.yaml cannot be written: No space left"):
+        changed._child(actor_spec("optimizer"), transport())
+    assert (tmp_path / "config.yaml").read_text() == before
 
 
 @pytest.mark.parametrize("is_state_kept", [True, False])

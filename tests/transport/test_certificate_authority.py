@@ -50,6 +50,23 @@ def test_access_list_of_each_service_holds_all_entries(authority: CertificateAut
     ]
 
 
+def test_failed_write_of_an_access_list_leaves_the_authority_unchanged(
+    authority: CertificateAuthority,
+) -> None:
+    of_service = authority.add("mule", "service", "mule", days=7) / "access.yaml"
+    before = read_access(authority.folder / "access.yaml")
+    of_service.unlink()
+    of_service.mkdir()  # A file cannot replace a folder.
+    with pytest.raises(ConfigError, match=f"{of_service} cannot be written"):
+        authority.add("front", "camera", "mule", days=7)
+    assert read_access(authority.folder / "access.yaml") == before
+    with pytest.raises(ConfigError, match="no keys named 'front'"):
+        authority.remove("front")
+    of_service.rmdir()
+    authority.add("front", "camera", "mule", days=7)
+    assert [entry.name for entry in authority.entries] == ["front", "mule"]
+
+
 def test_recreated_keys_get_a_new_common_name(authority: CertificateAuthority) -> None:
     authority.add("front", "camera", "mule", days=7)
     (old,) = authority.entries

@@ -4,6 +4,7 @@ import asyncio
 import socket
 import ssl
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -284,6 +285,65 @@ def test_gate_that_was_killed_is_started_again(
         with tls_client(port, keys):
             assert process.pid != killed
         process.close()
+
+
+def test_gate_that_was_redirected_while_it_ended_is_started_again(
+    router: EchoRouter, keys: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process that has closed its input stands for one that is about to end."""
+    close_input = "import os, time; os.close(0); print(1, flush=True); time.sleep(600)"
+    start, ending = GateProcess._start, list[subprocess.Popen[str]]()
+
+    def start_ending(_: GateProcess) -> subprocess.Popen[str]:
+        monkeypatch.setattr(GateProcess, "_start", start)
+        command = sys.executable, "-c", close_input
+        pipe = subprocess.PIPE
+        ending.append(subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True))
+        assert ending[0].stdout is not None
+        ending[0].stdout.readline()
+        return ending[0]
+
+    monkeypatch.setattr(GateProcess, "_start", start_ending)
+    with socket.create_server((LOOPBACK, 0)) as listener:
+        process, port = GateProcess(listener, 1), listener.getsockname()[1]
+        process.redirect(router.port)
+        ending[0].kill()
+        with tls_client(port, keys):
+            assert router.accepted == 1
+        process.close()
+
+
+def test_gate_that_was_redirected_while_it_was_started_leads_to_the_other_router(
+    router: EchoRouter, keys: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start, is_started, may_return = GateProcess._start, threading.Event(), threading.Event()
+
+    def start_slowly(process: GateProcess) -> subprocess.Popen[str]:
+        started = start(process)
+        is_started.set()
+        assert may_return.wait(PATIENCE_S)
+        return started
+
+    other = EchoRouter(keys)
+    with socket.create_server((LOOPBACK, 0)) as listener:
+        process, port = GateProcess(listener, router.port), listener.getsockname()[1]
+        monkeypatch.setattr(GateProcess, "_start", start_slowly)
+        process._process.kill()
+        assert is_started.wait(PATIENCE_S)
+        redirecting = threading.Thread(target=process.redirect, args=(other.port,))
+        redirecting.start()
+        redirecting.join(0.2)  # It should wait for the start.
+        may_return.set()
+        redirecting.join()
+
+        def reaches_other_router() -> bool:
+            with suppress(OSError, AssertionError), tls_client(port, keys):
+                pass  # The redirection may close a connection that was accepted before it.
+            return other.accepted > 0
+
+        eventually(reaches_other_router)
+        process.close()
+    other.close()
 
 
 def test_redirected_gate_closes_its_connections_and_leads_to_the_other_router(

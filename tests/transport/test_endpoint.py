@@ -56,6 +56,12 @@ def test_network_endpoint_without_keys_is_rejected(endpoint: str) -> None:
         Endpoint("mule", endpoint).require_safe()
 
 
+@pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:65536", "tcp/[::1]:99999"])
+def test_port_out_of_range_is_rejected(endpoint: str) -> None:
+    with pytest.raises(ConfigError, match="must be at most 65535"):
+        Endpoint("mule", endpoint)
+
+
 def test_keys_and_tls_require_each_other(tmp_path: Path) -> None:
     keys = TlsKeys(
         CertificateAuthority.new(tmp_path / "keys", days=2).add("mule", "service", "mule", days=1)
