@@ -93,6 +93,7 @@ class Monitor:
         self.pids: dict[str, set[int]] = {}
         self.graph: GraphCorrection | None = None
         self.objects: MapObjects | None = None
+        self.refined_s = float("nan")  # Time of the wait until no refinement was pending.
         kinds = {"pose/tracked": TrackedPose, "graph/correction": GraphCorrection,
                  "map/objects": MapObjects, "health/*": Health}  # fmt: skip
         self._subscribers = [
@@ -131,6 +132,12 @@ class Monitor:
                 for consumer, count in output.behind.items():
                     behind[consumer] = max(behind.get(consumer, 0), count)
         return behind
+
+    def is_refined(self) -> bool:
+        """Return whether the mapper has handled all keyframes and has no pending iterations."""
+        health = self.health["mapper"]
+        queued = sum(i.queued for i in health.inputs)
+        return not (queued or health.metrics.get("iterations_pending", 0))
 
     def is_settled(self) -> bool:
         """Return whether every message was handled and no work is pending."""
@@ -252,6 +259,8 @@ def wait_until_settled(monitor: Monitor) -> float:
             return float("nan")
         time.sleep(0.5)
         quiet = quiet + 1 if monitor.is_settled() else 0
+        if np.isnan(monitor.refined_s) and monitor.is_refined():
+            monitor.refined_s = time.monotonic() - started_s
     return time.monotonic() - started_s
 
 

@@ -138,6 +138,7 @@ def live(
         "age_ms_p95": float(np.percentile(ages_ms, 95)),
         "waiting_second_quarter": float(np.mean(waiting[quarter : 2 * quarter])),
         "waiting_last_quarter": float(np.mean(waiting[-quarter:])),
+        "refined_after_s": monitor.refined_s,
         "settled_after_s": pending_s,
         "iterations": metrics.get("iterations", 0),
         "objects": len(writer.objects()),
