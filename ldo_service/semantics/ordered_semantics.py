@@ -32,6 +32,7 @@ from .semantic_map_config import SemanticMapConfig
 MAX_KEYFRAMES = 1024
 # Maximum number of stored label results, about 100 B each. 1024 keyframes request fewer.
 MAX_RESULTS = 4096
+NOT_LABELLED = RegionLabelResult("", 0.0)
 # Offset added to region ids in label requests of the copy. It keeps them apart from the region
 # ids in requests of the live semantics.
 FIRST_REGION = 1 << 32
@@ -85,6 +86,9 @@ class OrderedSemantics:
     def apply_label(self, region: int, keyframe: int, answer: RegionLabelResult) -> bool:
         """Store a label result for a `DelayedCopy`; fuse it into `live` if `live` requested it.
 
+        The labeller answers in the order of the requests. Earlier requests without a result were
+        therefore lost, for example because they ended its process, and count as not labelled.
+
         Args:
             region: Id of the region in the request.
             keyframe: Keyframe of the request.
@@ -93,14 +97,24 @@ class OrderedSemantics:
         Returns:
             True if the label was fused into `live`.
         """
-        sent = [one for one in self._sent if (one.id, one.keyframe) == (region, keyframe)]
-        if sent:
-            self._sent.remove(sent[0])
-            if self._copy is not None:
-                self._results[request_key(sent[0])] = answer
-                while len(self._results) > MAX_RESULTS:
-                    del self._results[next(iter(self._results))]
+        places = [
+            place
+            for place, one in enumerate(self._sent)
+            if (one.id, one.keyframe) == (region, keyframe)
+        ]
+        if places:
+            *lost, answered = self._sent[: places[0] + 1]
+            del self._sent[: places[0] + 1]
+            for one in lost:
+                self._store_result(one, NOT_LABELLED)
+            self._store_result(answered, answer)
         return region < FIRST_REGION and self.live.apply_label(region, keyframe, answer)
+
+    def _store_result(self, request: Region, answer: RegionLabelResult) -> None:
+        if self._copy is not None:
+            self._results[request_key(request)] = answer
+            while len(self._results) > MAX_RESULTS:
+                del self._results[next(iter(self._results))]
 
     def mark_sent(self, region: int) -> None:
         """Record that the waiting label request of a region was sent."""

@@ -224,6 +224,15 @@ def test_saving_the_state_changes_no_message_of_idle_steps(
     assert list(map(encode, saved.messages)) == list(map(encode, late.messages))
 
 
+def test_request_that_the_labeller_never_answers_does_not_stop_the_correction() -> None:
+    """A request that ends the process of the labeller is set aside, without a result."""
+    late = walk_with_late_labels()
+    late.requests.popleft()
+    late.settle()
+    assert late.mapper.metrics()["labels_reordered"] == 1
+    assert late.mapper.metrics()["keyframes_to_relabel"] == 0
+
+
 def test_too_many_waiting_keyframes_keep_the_live_labels(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ordered_semantics, "MAX_KEYFRAMES", len(WAY))
     late = walk_with_late_labels().settle()
