@@ -179,6 +179,8 @@ def pixels_without_data(frame: RgbdFrame) -> np.ndarray:
         Mask [H, W] bool.
     """
     empty = (frame.depth_m == 0) & (brightest(frame.color) == 0)
+    if not any(side.any() for side in (empty[0], empty[-1], empty[:, 0], empty[:, -1])):
+        return np.zeros_like(empty)
     count, parts = cv2.connectedComponents(empty.astype(np.uint8), connectivity=4)
     is_rim = np.zeros(count, bool)
     for side in (parts[0], parts[-1], parts[:, 0], parts[:, -1]):

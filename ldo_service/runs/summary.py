@@ -102,7 +102,7 @@ def summarize(
         "calibration": {name: facts[name] for name in CALIBRATION if name in facts},
         "isa": kernels.isa(),
         **devices(metrics),
-        "cpus": os.cpu_count(),  # CPUs of the machine; a run may use fewer threads.
+        "threads": os.cpu_count(),  # CPUs of the machine; a run may use fewer threads.
         "versions": versions(),
     }
 
