@@ -78,8 +78,8 @@ from ldo_service.semantics.ordered_semantics import OrderedSemantics
 
 # Idle steps between two messages with changed Gaussians: some seconds of work, up to 4 MB.
 IDLE_STEPS_PER_DELTA = 8
-# Idle steps that take as long as the mapping of a keyframe.
-IDLE_STEPS_PER_KEYFRAME = 4
+# Steps of the correction of late labels that take as long as the mapping of a keyframe.
+LABEL_STEPS_PER_KEYFRAME = 4
 # Time without messages after which the camera stands still and late labels are corrected, seconds.
 # The result would depend on shorter pauses.
 STILL_AFTER_S = 5.0
@@ -276,10 +276,7 @@ class Mapper(Actor):
         return np.array(list(placed), np.int64)[shows].tolist()
 
     def _motion(self, keyframe: int) -> AnchorMotion:
-        """Return the motion that moves a keyframe's Gaussians to the current pose of the keyframe.
-
-        The motion starts at the pose to which these Gaussians were last moved.
-        """
+        """Return the motion of a keyframe's Gaussians from their last to its current pose."""
         T_map_gaussians = self._map.views.poses[keyframe]
         T_new_old = pose_to_message(self._poses[keyframe] @ se3.inverse(T_map_gaussians))
         return AnchorMotion(keyframe=keyframe, T_new_old=T_new_old)
@@ -332,12 +329,13 @@ class Mapper(Actor):
         yield from self._publish_changes(is_done=step.is_done)
 
     def _publish_changes(self, *, is_done: bool = True) -> Iterator[Output]:
-        """Publish the changes of some idle steps or of finished work, and save some of them."""
+        """Publish after some idle steps or finished work, and make the next checkpoint due."""
         if is_done or self._idle_steps % IDLE_STEPS_PER_DELTA == 0:
             yield from self._publisher.deltas(self._message_context(), with_changed=True)
             yield from self._objects()
-        unsaved = self._idle_steps - self._saved_steps
-        if is_done or unsaved >= IDLE_STEPS_PER_KEYFRAME * self._checkpoint_interval():
+        label_steps = LABEL_STEPS_PER_KEYFRAME * self._checkpoint_interval()
+        steps = IDLE_STEPS_PER_DELTA if self._refit.has_work() else label_steps
+        if is_done or self._idle_steps - self._saved_steps >= steps:
             self._checkpoint = {}  # The next snapshot is a new checkpoint.
 
     def on_stop(self) -> Iterator[Output]:

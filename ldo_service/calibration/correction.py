@@ -73,7 +73,7 @@ class CameraCorrection:
 
     @property
     def of_images(self) -> "CameraCorrection":
-        """The correction without the times of the shutter: what `applied` depends on."""
+        """Correction of images alone, without the times of the shutter."""
         return replace(self, timing=ShutterTiming())
 
     @property
@@ -124,8 +124,9 @@ class CameraCorrection:
 def read_correction(folder: Path) -> CameraCorrection:
     """Return the camera correction with which the last keyframe of a finished run was made.
 
-    The map converts the images of earlier keyframes to this correction. If there is no keyframe, or
-    if an older version of LDO-SLAM wrote the run, the result changes nothing.
+    The map converts the images of earlier keyframes to its vignetting and depth bias. The result
+    changes nothing if there is no keyframe, or if the version of LDO-SLAM that wrote the run did
+    not save corrections.
 
     Raises:
         DataError: keyframes.json of the folder cannot be read, or its content is invalid.

@@ -96,8 +96,8 @@ class PosedMap:
         trajectory: Poses T_map_camera of the frames that are not LOST.
         exposures: Exposures of the keyframes.
         semantics: Labels of the Gaussians; None without a detector.
-        correction: Correction of vignetting, depth bias and rolling shutter of the camera, to which
-            the map has converted its keyframes.
+        correction: Vignetting and depth bias to which the map has converted its keyframes, and the
+            last timing of the shutter.
         objects: Objects of the map; None without a detector.
     """
 

@@ -73,6 +73,7 @@ class KeyframeStore:
         self.config = config or KeyframeStoreConfig()
         self.files = ChecksummedFolder(folder, "keyframe", _DISK_FULL)
         self.correction: CameraCorrection | None = None
+        self._is_converting = False  # True if `get` may return other images than those of `put`.
         self._cache: OrderedDict[int, KeyframeImages] = OrderedDict()  # Least recently used first.
         self._reads = self._forgotten = self._damaged = 0
         self._make_room()
@@ -99,6 +100,7 @@ class KeyframeStore:
     def convert_to(self, correction: CameraCorrection | None) -> None:
         """Convert the images of later `get` calls from their own correction to this one."""
         self.correction = correction
+        self._is_converting |= len(self) > 0
         for keyframe in [k for k in self._cache if k in self.files.sizes]:
             del self._cache[keyframe]
         self._cache = OrderedDict((k, self._converted(i)) for k, i in self._cache.items())
@@ -112,7 +114,9 @@ class KeyframeStore:
         Raises:
             KeyError: The images of the keyframe are dropped or unreadable.
         """
-        images = self._read(keyframe) or self._cache.get(keyframe)
+        images = self._cache.get(keyframe)
+        if images is None or self._is_converting:
+            images = self._read(keyframe) or images
         if images is None:
             raise KeyError(keyframe)
         counts = ~pixels if images.mask is None else ~pixels & (images.mask > 0)
@@ -236,6 +240,8 @@ class KeyframeViews:
         self.poses = PoseTable()
         self.exposures: dict[int, Exposure] = {}
         self.horizons: dict[int, MaxDepthGrid] = {}
+        # Keyframes of an older version of LDO-SLAM, whose correction is unknown.
+        self._unconverted: set[int] = set()
 
     def add(self, view: TrainingView, horizon: MaxDepthGrid) -> list[int]:
         """Add the newest keyframe.
@@ -263,28 +269,25 @@ class KeyframeViews:
                 del table[keyframe]
         return gone
 
-    def convert_to(self, correction: CameraCorrection) -> bool:
+    def convert_to(self, correction: CameraCorrection) -> None:
         """Convert all keyframes to a correction of the camera, for images that arrive with it.
 
         The horizons stay, because the Gaussians of these keyframes stay where they were added.
 
         Args:
             correction: The correction; the times of the shutter do not matter.
-
-        Returns:
-            Whether the images of earlier keyframes change.
         """
         before, now = self.store.correction, correction.of_images
         if before == now:
-            return False
+            return
         self.store.convert_to(now)
-        if before is None or not self.exposures:
-            return False
+        if before is None:
+            return
         change = CorrectionChange(before, now)
         for keyframe, exposure in self.exposures.items():
-            factor = change.brightness(self.cameras[keyframe])
-            self.exposures[keyframe] = Exposure(factor * exposure.gain, factor * exposure.bias)
-        return True
+            if keyframe not in self._unconverted:
+                factor = change.brightness(self.cameras[keyframe])
+                self.exposures[keyframe] = Exposure(factor * exposure.gain, factor * exposure.bias)
 
     def placed(self, keyframe: int) -> PlacedCamera:
         """Return the camera and pose of a keyframe, with the largest depth in each image block.
@@ -333,6 +336,7 @@ class KeyframeViews:
             "exposures": np.array(exposures, np.float32).reshape(-1, 2, 3),
             "horizons": np.array(horizons, np.float32).reshape(-1, *BLOCKS),
             "correction": self.store.correction and self.store.correction.pack(),
+            "unconverted": sorted(self._unconverted),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -343,5 +347,7 @@ class KeyframeViews:
         self.exposures = dict(zip(keyframes, map(Exposure.of, state["exposures"]), strict=True))
         self.horizons = dict(zip(keyframes, map(MaxDepthGrid, state["horizons"]), strict=True))
         self.store.keep_only(keyframes)
-        correction = state.get("correction")  # Older versions of LDO-SLAM did not save it.
+        # Older versions of LDO-SLAM saved neither of the two.
+        self._unconverted = set(state.get("unconverted", keyframes))
+        correction = state.get("correction")
         self.store.convert_to(correction and CameraCorrection.of(correction))

@@ -170,10 +170,12 @@ def valid_pixels(camera: Camera) -> np.ndarray | None:
 
 
 def pixels_without_data(frame: RgbdFrame) -> np.ndarray:
-    """Return the pixels at the border of a frame for which the camera delivered no data.
+    """Return the pixels in regions without color and depth that touch the border of a frame.
 
-    Rectification and the compensation of motion leave a rim of such pixels. They are black and have
-    no depth. The mask is one pixel wider, because interpolation darkens the pixels next to the rim.
+    Rectification and the compensation of motion leave a rim of such pixels. The color must be
+    exactly black, so the rim of a compressed image is not found. A black object without depth at
+    the border is masked too. The mask is one pixel wider, because interpolation darkens the pixels
+    next to the rim.
 
     Returns:
         Mask [H, W] bool.

@@ -110,9 +110,8 @@ def test_late_estimate_of_the_vignetting_corrects_the_map_and_its_keyframes(
 ) -> None:
     """The first keyframes were mapped as the camera recorded them, with dark corners."""
     vignetting = CameraCorrection(vignetting=((-0.8, 0.0, 0.0),) * 3)
-    gain = vignetting.gain(
-        posed_frames[0][0].camera
-    )  # The strongest vignetting over that of a pixel.
+    # The strongest vignetting divided by that of a pixel.
+    gain = vignetting.gain(posed_frames[0][0].camera)
     recorded = {
         i: (replace(frame, color=(frame.color * (gain.min() / gain)).astype(np.uint8)), T)
         for i, (frame, T) in posed_frames.items()
@@ -142,6 +141,32 @@ def test_late_estimate_of_the_vignetting_corrects_the_map_and_its_keyframes(
     for keyframe in range(4):
         assert (restored.views[keyframe].color == late.views[keyframe].color).all()
     assert restored.views.store.correction == vignetting
+
+
+def test_state_of_an_older_version_keeps_its_exposures_and_images(
+    posed_frames: dict, tmp_path: Path
+) -> None:
+    """Older versions saved no correction, so the images of their keyframes are not converted."""
+    vignetting = CameraCorrection(vignetting=((-0.8, 0.0, 0.0),) * 3)
+    first = build_map(posed_frames, iterations=0, folder=tmp_path)
+    state = first.snapshot()
+    for key in ("correction", "unconverted"):
+        del state["views"][key]
+    for keyframe in first.views.cameras:
+        images = first.views.store.get(keyframe)
+        assert images is not None
+        first.views.store.put(replace(images, correction=None))
+    restored = MapBuilder(folder=tmp_path)
+    restored.restore(state)
+    gains = [exposure.gain.tolist() for exposure in restored.views.exposures.values()]
+    restored.views.convert_to(CameraCorrection())
+    restored.views.convert_to(vignetting)
+    assert [exposure.gain.tolist() for exposure in restored.views.exposures.values()] == gains
+    assert (restored.views[1].color == first.views[1].color).all()
+    again = MapBuilder(folder=tmp_path)
+    again.restore(restored.snapshot())
+    again.views.convert_to(CameraCorrection())
+    assert [exposure.gain.tolist() for exposure in again.views.exposures.values()] == gains
 
 
 def test_black_rim_of_rectification_is_not_mapped(posed_frames: dict) -> None:
