@@ -87,8 +87,8 @@ class OrderedSemantics:
         """Store a label result for a `DelayedCopy`; fuse it into `live` if `live` requested it.
 
         The labeller answers in the order of the requests. Earlier requests without a result were
-        therefore lost, for example because they ended its process, and count as not labelled.
-        A lost request is not recognized before a later one is answered.
+        therefore lost, for example because they ended its process. The `DelayedCopy` counts them as
+        not labelled. A lost request is not recognized before a later one is answered.
 
         Args:
             region: Id of the region in the request.
@@ -108,8 +108,6 @@ class OrderedSemantics:
             del self._sent[: places[0] + 1]
             for one in lost:
                 self._store_result(one, NOT_LABELLED)
-                if one.id < FIRST_REGION:
-                    self.live.apply_label(one.id, one.keyframe, NOT_LABELLED)
             self._store_result(answered, answer)
         return region < FIRST_REGION and self.live.apply_label(region, keyframe, answer)
 
